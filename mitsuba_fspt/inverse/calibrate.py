@@ -191,11 +191,11 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
 
 
 def _noise(images: Sequence[Image]) -> float:
-    """Median of the errors that are > 0 over the brightest pixel; 0 where no image has an error."""
-    errors = [image.error[image.error > 0] for image in images if image.error is not None]
+    """Median of the errors that are > 0 over the brightest pixel, without mask; 0 where no image has an error."""
+    errors = [image.error[image.kept & (image.error > 0)] for image in images if image.error is not None]
     if not errors or not (values := np.concatenate(errors)).size:
         return 0.0
-    return float(np.median(values) / max(max(float(image.power.max()) for image in images), 1e-300))
+    return float(np.median(values) / max(max(float(i.power[i.kept].max(initial=0)) for i in images), 1e-300))
 
 
 class _Renderings:

@@ -375,7 +375,8 @@ def small_disk_error() -> float:
     """Peak error of a disk out of focus that is smaller than its blur, against the overlap of two circles.
 
     From the point h off the axis in the virtual detector plane, a disk of radius r at z covers a circle of the pupil,
-    of radius r u/|u − z|, its centre h z/|u − z| off the pupil's. P = J_n/π · A_vd · (area of the overlap) cos⁴θ/u².
+    of radius r u/|u − z|, its centre h z/|u − z| off the pupil's. P = J_n/π · A_vd · (area of the overlap) cos⁴θ/u²,
+    with θ at the centre of the disk, which is right to 4e-4 of the peak.
     """
     z, radius, pitch = 110.0, 0.8, 0.1
     side = pitch * (FOCUS - FOCAL) / FOCAL
