@@ -180,6 +180,7 @@ def _integrate(
     """Power, error [W] and coverage, shape (h, w), by the deterministic integral, and metadata."""
     from ..camera.of_sensor import camera_of
     from ..integral.lines.scene_checks import check_scene, check_surfaces_alone
+    from ..integral.lines.specular import longest_course
 
     with named("fspt_integral"):
         quadrature = replace(integrator.quadrature, **{k: value for k, value in accuracy.items() if value is not None})
@@ -193,10 +194,13 @@ def _integrate(
     pixels, largest = solution.beyond(quadrature.rtol)
     if pixels:
         stopped = "stopped by max_time: " if deadline.cut else ""
-        warnings.append(
-            f"{stopped}rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the "
-            "peak)"
-        )
+        unmet = f"rtol {quadrature.rtol:g} not reached on {pixels} pixels (largest error {largest:.1e} of the peak)"
+        warnings.append(stopped + unmet)
+        if quadrature.max_specular < (surfaces := longest_course(scene)):
+            warnings.append(
+                f"light that panes reflect twice meets up to {surfaces} specular surfaces, of which 'max_specular' "
+                f"follows {quadrature.max_specular}: a larger one may lower the error"
+            )
     if left_out is not None:
         how["light_left_out"], how["light_left_out_error"] = left_out.share, left_out.error
         warnings += filter(None, [left_out.warning(quadrature.rtol)])

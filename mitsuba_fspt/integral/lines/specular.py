@@ -177,6 +177,16 @@ def lobes_of(bsdf: mi.BSDF) -> tuple[str, ...]:
     return tuple(name for name, flag in DELTA.items() if mi.has_flag(bsdf.flags(), flag))
 
 
+def longest_course(scene: mi.Scene) -> int:
+    """Surfaces on a course that two panes turn back once each: every border of glass three times, every mirror once.
+
+    0 without panes. Light on longer courses is reflected by glass at least four times: with the weight R⁴.
+    """
+    kinds = [set(lobes_of(bsdf)) for shape in scene.shapes() if (bsdf := specular_bsdf(shape)) is not None]
+    borders = sum(2 if "transmission" in lobes else 1 for lobes in kinds if len(lobes) > 1)
+    return 3 * borders + sum(lobes == {"reflection"} for lobes in kinds) if borders else 0
+
+
 def _mirror(rough: mi.BSDF) -> mi.BSDF | None:
     """A smooth conductor like a rough one of roughness 0; None where it is rougher."""
     numbers = mi.traverse(rough)

@@ -288,6 +288,17 @@ def test_what_is_cut_off_is_in_the_error():
     assert (missing <= few.error + many.error).all()
 
 
+@pytest.mark.parametrize("most", [8, 12])
+def test_too_few_surfaces_for_light_between_two_plates_are_told(most):
+    """Light that two plates of glass reflect once each meets each of the four borders up to three times."""
+    scene = camera_scene(sphere(FOCUS, 8), bodies=(slab(60), slab(90)), crop=(18, 14, 2, 2))
+    image = fspt.render(scene, rtol=2e-3, max_specular=most)
+    beyond = (image.error > 2e-3 * image.power.max()).any()
+    assert beyond == (most < 12)
+    hint = "up to 12 specular surfaces, of which 'max_specular' follows 8: a larger one may lower the error"
+    assert (hint in image.metadata.get("warnings", "")) == beyond
+
+
 def test_coverage_counts_glowing_surfaces_behind_windows():
     plate = {"type": "rectangle", "to_world": place(100, size=2.0), "bsdf": {"type": "diffuse"}}
     cases = {"bare": (), "pane": (pane(80, PANE),), "plate": (plate,), "both": (plate, pane(80, PANE))}
