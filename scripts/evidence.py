@@ -74,8 +74,8 @@ def check_location(rows: Rows) -> list[str]:
     (row,) = (row for row in rows if row["case"] == "4 views, 1000 electrons")
     failures = [f for axis in "xyz" for f in within(f"sd of {axis} [mm]", float(row[f"sd_{axis}_mm"]), 0, 0.0149)]
     failures += within("sd of the power [%]", float(row["sd_power_percent"]), 0, 0.3)
-    for row in rows:  # 240 values a case: 0.90 ± 2.6 standard errors
-        failures += within(f"{row['case']}: share of intervals that contain the value", float(row["holds"]), 0.85, 0.95)
+    for row in rows:  # 60 images a case, the power correlated with x by -0.7: 0.90 ± 3.3 standard errors
+        failures += within(f"{row['case']}: share of intervals that contain the value", float(row["holds"]), 0.82, 0.98)
     return failures
 
 

@@ -732,6 +732,13 @@ MUTANTS = (
         ("tests/inverse/test_damped_steps.py",),
     ),
     Mutant(
+        "change between node rules that agree by chance",
+        "integral/pupil/nodes.py",
+        "AGREEMENT = 2.0",
+        "AGREEMENT = 1.0",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
         "correction along transects",
         "integral/pupil/transects.py",
         "if count >= MANY:",

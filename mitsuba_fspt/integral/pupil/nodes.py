@@ -29,6 +29,9 @@ BOTH = 4 + 12  # lines of sight a pixel of both rules; with fewer allowed only f
 # lies in the pixel: the image's curvature, from which the error follows, is that over a pixel.
 FALLOFF, IN_PIXEL = 0.1, 0.5
 LIGHT_KNOWN = 2.0  # factor to which the light that surfaces send to a pixel is known
+# Error of a node rule over the change of the value from the rule before. Where J_n is rough, both rules have errors of
+# like size, and by chance their change is smaller on some of a thousand pixels (scripts/every_pixel.py).
+AGREEMENT = 2.0
 TURN_REACH = 2  # pixels around over which the correction `four_turn` is averaged, to leave out the roughness of J_n
 
 
@@ -133,9 +136,9 @@ def _one_suffices(draft: Draft) -> bool:
 
 
 def _refine(draft: Draft, where: Mask) -> PixelArray:
-    """Twelve nodes on the marked pixels; returns the change of the value there, 0 elsewhere."""
+    """Twelve nodes on the marked pixels; returns their error by the change of the value there, 0 elsewhere."""
     seen = apply_nodes(draft, node_rules.twelve(draft.area), where, REFINED)
-    difference = dr.select(where, dr.abs(seen.value - draft.value), 0)
+    difference = dr.select(where, dr.opaque(mi.Float64, AGREEMENT) * dr.abs(seen.value - draft.value), 0)
     draft.value = dr.select(where, seen.value, draft.value)
     draft.set_coverage(dr.select(where, seen.coverage, draft.coverage))
     draft.nearest = dr.minimum(draft.nearest, seen.nearest)

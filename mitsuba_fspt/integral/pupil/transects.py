@@ -18,7 +18,7 @@ from ..quadrature import FLOAT32_FLOOR
 from . import node_rules
 from .draft import Draft
 from .jumps import integrate_transect
-from .nodes import apply_nodes
+from .nodes import AGREEMENT, apply_nodes
 from .transect import transect
 
 if TYPE_CHECKING:
@@ -216,8 +216,8 @@ class _Refinement:
         if count >= MANY:
             remaining = dr.maximum(remaining, dr.abs(self.means.value - self.means.plain))
         if level <= node_rules.SMOOTH_LEVELS:
-            # On smooth pixels the next node rule changes the value by less than this one did.
-            remaining = dr.select(self.smooth, change, remaining)
+            # On smooth pixels the next node rule changes the value by less than this one did, but for chance.
+            remaining = dr.select(self.smooth, dr.opaque(mi.Float64, AGREEMENT) * change, remaining)
         remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
         expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)
         unexpected = self.where & (change > expected)
