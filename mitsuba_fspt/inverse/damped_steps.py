@@ -66,7 +66,7 @@ class DampedSteps:
         """
         while True:
             step, fall = linear.step(self._damping)
-            if fall <= self._end:
+            if not fall > self._end:  # NaN where a slope is infinite
                 self._damping = self._first
                 return None
             if np.abs(step).max() <= self._longest and (found := attempt(step)) is not None:

@@ -66,6 +66,12 @@ def test_no_step_is_left_where_none_succeeds():
     assert damped.lower(linear, lambda step: step) == pytest.approx([3, 4], rel=2e-3)
 
 
+def test_slopes_that_are_no_numbers_end_the_search():
+    """Seen not to come to an end where only a small fall ended it."""
+    linear = LinearFit(np.ones(2), np.full((2, 2), np.nan), np.ones(2))
+    assert DampedSteps(0.01).lower(linear, lambda step: None) is None
+
+
 def test_the_first_step_alone_is_bounded():
     """10 sd away with `longest` 1: the first step is at most 1 long, the second goes as far as the slopes say."""
     damped = DampedSteps(1e-9, longest=1.0)
