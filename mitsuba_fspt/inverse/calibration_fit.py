@@ -190,9 +190,9 @@ class CalibrationFit:
         y, damped = np.zeros(len(self.start)), DampedSteps(self.settings.chi2, longest=self.settings.reach)
         for _ in range(self.settings.steps):
             image, sigma = self._weighted(y)
-            linear = LinearFit.of(self._whitened(sigma), self._residual(image, sigma))
-            self._refusal = None
-            nearer = damped.lower(linear, partial(self._nearer, y, sigma))
+            residual, self._refusal = self._residual(image, sigma), None
+            linear = LinearFit.of(self._whitened(sigma), residual)
+            nearer = damped.lower(linear, partial(self._nearer, y, sigma, float(residual @ residual)))
             if nearer is not None:
                 y = nearer
                 self._follow(y)
@@ -208,14 +208,15 @@ class CalibrationFit:
             "<default> values."
         )
 
-    def _nearer(self, y: Array, sigma: Array, step: Array) -> Array | None:
-        """y + step if there is an image and Σ (residual/σ)² is less than at y."""
+    def _nearer(self, y: Array, sigma: Array, before: float, step: Array) -> Array | None:
+        """y + step if there is an image and its Σ (residual/σ)² is less than `before`."""
         try:
-            before, after = (np.sum(self._residual(self._power(one), sigma) ** 2) for one in (y, y + step))
+            image = self._power(y + step)
         except REFUSALS as refusal:
             self._refusal = refusal
             return None
-        return y + step if after < before else None
+        self._refusal = None
+        return y + step if np.sum(self._residual(image, sigma) ** 2) < before else None
 
     def _residual(self, image: Array, sigma: Array) -> Array:
         """(pixels that count,) measured − fitted power, in standard deviations."""
@@ -249,8 +250,18 @@ class CalibrationFit:
         return (self._kept.slopes / sigma[..., None])[self.measured.used]
 
     def _slope(self, y: Array, way: Array, length: float = 1.0) -> Array:
-        """Change of the images [W] along a way."""
-        return (self._power(y + length * way) - self._power(y - length * way)) / (2 * length)
+        """Change of the images [W] along a way, by a difference to both sides; to one where the other has no image."""
+        try:
+            ahead, span = self._power(y + length * way), length
+        except REFUSALS:
+            ahead, span = self._power(y), 0.0
+        try:
+            behind, span = self._power(y - length * way), span + length
+        except REFUSALS:
+            if span == 0:
+                raise
+            behind = self._power(y)
+        return (ahead - behind) / span
 
     def _chosen_steps(self, first: Array) -> Array:
         """Step of each parameter that changes the image by `CalibrationSettings.change`, to a factor of 3."""

@@ -38,7 +38,9 @@ class LinearFit:
 
     @property
     def fall(self) -> float:
-        """Fall of Σ r² by the step without damping."""
+        """Fall of Σ r² by the step without damping; NaN where a slope is infinite."""
+        if not np.isfinite(self.normal).all():
+            return np.nan
         return float(self.right @ np.linalg.lstsq(self.normal, self.right)[0])
 
     def step(self, damping: float) -> tuple[Array, float]:
@@ -51,7 +53,7 @@ class DampedSteps:
     """Steps each of which lowers Σ r², with a λ that follows their success.
 
     end : fall of Σ r² for which no step is tried
-    longest : of the changes of values by the first step
+    longest : bound of the change of each value by the first step; a later step is at most ten times the one before it
     damping, least : first and least λ
     """
 
@@ -60,16 +62,25 @@ class DampedSteps:
         self._damping = damping
 
     def lower(self, linear: LinearFit, attempt: Callable[[Array], T | None]) -> T | None:
-        """What `attempt` makes of the longest step (p,) for which it is not None; None where no step is left.
+        """The result of the first `attempt` at a step (p,) that is not None, with a larger λ each time.
 
-        λ rises tenfold after each step that fails, and falls tenfold after one that does not.
+        None where no step is left: the fall of the next one is at most `end`. λ begins where it is more, if the step
+        without damping is: along what the slopes determine weakly, a larger λ leaves nearly nothing of the step.
         """
+        while self._damping > self._least and linear.step(self._damping)[1] <= self._end < linear.fall:
+            self._damping *= 0.1
         while True:
             step, fall = linear.step(self._damping)
             if not fall > self._end:  # NaN where a slope is infinite
                 self._damping = self._first
                 return None
-            if np.abs(step).max() <= self._longest and (found := attempt(step)) is not None:
-                self._damping, self._longest = max(0.1 * self._damping, self._least), np.inf
+            if np.abs(step).max() > self._longest:
+                if linear.step(10 * self._damping)[1] > self._end:
+                    self._damping *= 10
+                    continue
+                step *= self._longest / np.abs(step).max()
+            if (found := attempt(step)) is not None:
+                self._damping = max(0.1 * self._damping, self._least)
+                self._longest = max(self._longest, 10 * np.abs(step).max())
                 return found
             self._damping *= 10

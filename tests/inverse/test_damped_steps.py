@@ -66,6 +66,23 @@ def test_no_step_is_left_where_none_succeeds():
     assert damped.lower(linear, lambda step: step) == pytest.approx([3, 4], rel=2e-3)
 
 
+@pytest.mark.parametrize("damping", [1e-3, 1e4])
+def test_a_weak_direction_is_followed_to_its_end(damping):
+    """Two nearly equal columns, condition number 900, from 1 sd beside the minimum along what they determine weakly.
+
+    Seen to fail, with no step at all, where the damped step alone ended the search.
+    """
+    angle = 2 * np.arctan(1 / 900)
+    matrix = np.array([[1.0, np.cos(angle)], [0.0, np.sin(angle)]])
+    weak = np.linalg.svd(matrix)[2][-1]
+    at, damped = weak / np.linalg.norm(matrix @ weak), DampedSteps(0.01, damping=damping)
+    for _ in range(20):
+        if (nearer := damped.lower(LinearFit.of(matrix, -matrix @ at), lambda step, at=at: at + step)) is None:
+            break
+        at = nearer
+    assert np.sum((matrix @ at) ** 2) <= 0.01
+
+
 def test_slopes_that_are_no_numbers_end_the_search():
     """Seen not to come to an end where only a small fall ended it."""
     linear = LinearFit(np.ones(2), np.full((2, 2), np.nan), np.ones(2))
