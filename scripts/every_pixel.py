@@ -4,9 +4,10 @@
                                   [-o docs/every_pixel.csv]
 
 The images are those of `ordinary_scenes.py`. The matrix, at an `rtol` of 3e-4, traces no line of sight but where
-surfaces may hide each other. Columns: pixels on which surfaces can be seen; pixels on which the power differs from T J,
+surfaces may hide each other. Columns: pixels with an error above 0; pixels on which the power differs from T J,
 apart from the error of T J, by more than `rtol` times the brightest pixel, and by more than the stated error; pixels
-whose stated error is above `rtol`; the largest of the differences over the error stated; lines of sight in millions.
+whose stated error is above `rtol`; the largest of the differences over the error stated, but for pixels with an error
+of 0, whose number is `beyond_zero`; lines of sight in millions.
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ def counts(image: fspt.Image, power: np.ndarray, own: np.ndarray, rtol: float) -
     peak, stated = power.max(), np.asarray(image.error)
     off = np.maximum(np.abs(image.power - power) - own, 0)
     beyond = off > stated
-    worst = (off[beyond] / np.maximum(stated[beyond], 1e-300)).max(initial=0.0)
+    some = beyond & (stated > 0)
     return {
         "pixels": int((stated > 0).sum()),
         "beyond_rtol": int((off > rtol * peak).sum()),
         "beyond_error": int(beyond.sum()),
         "stated": int((stated > rtol * peak).sum()),
-        "largest_ratio": float(f"{worst:.3g}"),
+        "beyond_zero": int((beyond & ~some).sum()),
+        "largest_ratio": float(f"{(off[some] / stated[some]).max(initial=0.0):.3g}"),
         "lines": float(f"{image.metadata['nodes'] / 1e6:.3g}"),
     }
 

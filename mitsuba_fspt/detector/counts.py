@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FIRST, FITS, TIFF, read_frame
+from ..images.frame_file import FIRST, FITS, LAST, TIFF, read_frame
 from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
@@ -88,6 +88,36 @@ def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Coun
             f"reduce: '{name}' has the shape {found.values.shape}, the counts {shape}. Give a frame of the same film."
         )
     return found
+
+
+def tell_time(counts: Counts, given: float) -> None:
+    """Say in one line on stderr that the file of the counts states another exposure time than the given one."""
+    stated = counts.exposure_time
+    if stated is not None and abs(stated - given) > SAME_TIME * given:
+        LOG.warning(
+            "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
+            given,
+            stated,
+        )
+
+
+def tell_rows(counts: Counts) -> None:
+    """Say in one line on stderr that the file of the counts does not state which of its rows is the top one."""
+    if counts.top_row is None:
+        LOG.warning(
+            "fspt: reduce: the FITS file of the counts has no ROWORDER of TOP-DOWN or BOTTOM-UP; its first row is "
+            "taken for the top one. If the image is upside down, set ROWORDER = BOTTOM-UP in all frames of this camera."
+        )
+
+
+def require_same_rows(name: str, frame: Counts, counts: Counts) -> None:
+    """Raise DetectorError if of the frame `name` and the counts one is turned and the other does not state its rows."""
+    if {frame.top_row, counts.top_row} == {LAST, None}:
+        silent, turned = (name, "counts") if frame.top_row is None else ("counts", name)
+        raise DetectorError(
+            f"reduce: '{silent}' has no ROWORDER, '{turned}' is BOTTOM-UP. Their rows would not match: set ROWORDER in "
+            "both FITS files."
+        )
 
 
 def require_same_time(name: str, frame: Counts, other: str, time: float | None) -> None:

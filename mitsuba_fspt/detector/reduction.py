@@ -34,7 +34,18 @@ from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
 from ..runtime.numbers import number, whole
-from .counts import CLICK, SAME_TIME, Counts, Frame, frame_like, frame_of, require_same_time, tell_unequal_frames
+from .counts import (
+    CLICK,
+    Counts,
+    Frame,
+    frame_like,
+    frame_of,
+    require_same_rows,
+    require_same_time,
+    tell_rows,
+    tell_time,
+    tell_unequal_frames,
+)
 from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
@@ -146,9 +157,11 @@ class Corrections:
                 )
             return self.flat
         bias = counts.bias if self.bias is None else frame_like(self.bias, "bias", shape).values
+        flat = frame_of(self.flat, "flat")
+        require_same_rows("flat", flat, counts)
         found = flat_field(
             detector,
-            self.flat,
+            flat,
             self.flat_kind,
             self.scene,
             shape,
@@ -161,15 +174,18 @@ class Corrections:
         tell_loss(found, detector.gain_error)
         return found
 
-    def bad(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """True (h, w) on the pixels to leave out; DetectorError for a mask of another size."""
+    def bad(self, counts: Counts) -> NDArray[np.bool_]:
+        """True (h, w) on the pixels to leave out; DetectorError for a mask of another size or order of rows."""
+        shape = counts.values.shape
         if self.bad_pixels is None:
             return np.zeros(shape, bool)
         given = self.bad_pixels
         if not isinstance(given, (str, os.PathLike)):
             given = np.asarray(given)
             given = given.astype(np.uint8) if given.dtype == bool else given
-        return frame_like(given, "bad_pixels", shape).values != 0
+        found = frame_like(given, "bad_pixels", shape)
+        require_same_rows("bad_pixels", found, counts)
+        return found.values != 0
 
 
 def light_of(
@@ -203,8 +219,8 @@ def reduce_counts(
         exposed = replace(exposed, binning=raw.binning or 1)
     if exposed.pixel_pitch is None and detector.pixel_pitch is None:
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
-    _tell_time(raw, exposed)
-    _tell_rows(raw)
+    tell_time(raw, exposed.exposure_time)
+    tell_rows(raw)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
@@ -216,7 +232,7 @@ def reduce_counts(
     read = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2
     shared = dark.shared(independent + read, raw.frames, metadata or {})
     independent = independent + raw.frames * dark.added
-    mask = full | rays | corrections.bad(shape)
+    mask = full | rays | corrections.bad(raw)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
     image = replace(image, metadata=image.metadata | shared)
     light = detector.excess * np.maximum(electrons.mean(), 0)
@@ -224,26 +240,6 @@ def reduce_counts(
     tell_unequal_frames(raw, float(np.mean(dark.level)), float(noise))
     _report_darkness(image)
     return image
-
-
-def _tell_time(raw: Counts, exposed: Exposed) -> None:
-    """Say in one line on stderr that the file of the counts states another exposure time than the given one."""
-    stated, given = raw.exposure_time, exposed.exposure_time
-    if stated is not None and abs(stated - given) > SAME_TIME * given:
-        LOG.warning(
-            "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
-            given,
-            stated,
-        )
-
-
-def _tell_rows(raw: Counts) -> None:
-    """Say in one line on stderr that the file of the counts does not state which of its rows is the top one."""
-    if raw.top_row is None:
-        LOG.warning(
-            "fspt: reduce: the FITS file of the counts has no ROWORDER; its first row is taken for the top one. If the "
-            "image is upside down, set ROWORDER = BOTTOM-UP in all frames of this camera."
-        )
 
 
 def _report_darkness(image: Image) -> None:
@@ -349,6 +345,8 @@ def _background(
     reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
     given = raw.bias if bias is None else bias
     empty = None if given is None else frame_like(given, "bias", shape)  # without dark charge
+    if empty is not None:
+        require_same_rows("bias", empty, raw)
     zero = detector.on_pixels("bias", shape)
     noise: Array | float = 0.0  # variance of the bias frame
     if empty is not None:
@@ -362,6 +360,7 @@ def _background(
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", shape)
+        require_same_rows("dark", found, raw)
         require_same_time("dark", found, "counts", exposed.exposure_time)
         shown = gain * (found.values - zero)
         charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)

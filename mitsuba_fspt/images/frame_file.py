@@ -71,7 +71,10 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
             unit = units[0]
             header = {key: unit.header.get(key, file[0].header.get(key)) for key in KEYWORDS}
             blank = unit.header.get("BLANK")
-            blank = None if blank is None else blank * unit.header.get("BSCALE", 1) + unit.header.get("BZERO", 0)
+            if type(blank) is int:  # of other types astropy says that it ignores them
+                blank = blank * unit.header.get("BSCALE", 1) + unit.header.get("BZERO", 0)
+            else:
+                blank = None
             data = np.asarray(unit.data)
     except Exception as cause:
         raise ImageError(

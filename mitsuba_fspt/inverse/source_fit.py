@@ -48,7 +48,8 @@ class LocationSettings:
         steps that only the border of the tissue shortens lead to no minimum inside
     model_error : factor of the stated error of SP3 or diffusion (Eq. M.51); 0: images made with the same equation
     chance : p-value of a source above which a warning says that noise alone may look like it
-    stuck : share of `chi2` below which no step is tried: the minimum is at the border, or beyond
+    stuck : no step is tried of which Σ (residual/σ)² would fall by less than this share of `chi2`: the minimum is at
+        the border, or beyond
     apart : least singular value of the slopes with columns of length 1, over the largest; below it sources count as not
         determined separately
     """

@@ -332,13 +332,30 @@ def test_rows_of_fits_files(tmp_path, caplog):
     fits.PrimaryHDU(counts).writeto(tmp_path / "open.fits")
     np.testing.assert_array_equal(read_counts(tmp_path / "open.fits").values, counts)
     CCD.reduce(tmp_path / "open.fits", **SETTINGS)
-    assert caplog.text.count("has no ROWORDER; its first row is taken for the top one") == 1
+    assert caplog.text.count("has no ROWORDER of TOP-DOWN or BOTTOM-UP; its first row is taken for the top one") == 1
     hdu.header.update({"XBINNING": 1, "YBINNING": 2})
     hdu.writeto(tmp_path / "a.fits", overwrite=True)
     with pytest.raises(ImageError, match="binned 1 x 2"):
         read_counts(tmp_path / "a.fits")
     with pytest.raises(ImageError, match="got uint16 of shape"):
         CCD.reduce(np.ones((20, 30, 3), np.uint16), **SETTINGS)
+
+
+@pytest.mark.parametrize("name", ["bias", "dark", "flat", "bad_pixels"])
+@pytest.mark.parametrize("turned", ["counts", "frame"])
+def test_frames_of_another_order_of_rows_than_the_counts_are_refused(tmp_path, name, turned):
+    """One file is turned by its ROWORDER, the other states none. Seen to fail: up to twice the brightest pixel off."""
+    fits = pytest.importorskip("astropy.io.fits")
+    files = {}
+    for kind in ("counts", "frame"):
+        hdu = fits.PrimaryHDU(np.arange(100, 112, dtype=np.uint16).reshape(3, 4))
+        if kind == turned:
+            hdu.header["ROWORDER"] = "BOTTOM-UP"
+        files[kind] = tmp_path / f"{kind}.fits"
+        hdu.writeto(files[kind])
+    kind = {"flat_kind": "sensor"} if name == "flat" else {}
+    with pytest.raises(DetectorError, match=r"has no ROWORDER, '.*' is BOTTOM-UP"):
+        CCD.reduce(files["counts"], exposure_time=60, wavelength_nm=650, **{name: files["frame"]}, **kind)
 
 
 @pytest.mark.parametrize("wrong", ["60.0 s", "", "inf"])

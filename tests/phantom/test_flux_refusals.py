@@ -228,7 +228,7 @@ def test_values_of_triangles_in_another_order_than_the_tetrahedra(tmp_path):
         mesh = meshio.Mesh(POINTS, [("tetra", ELEMENT), ("triangle", faces[order])])
         mesh.write(tmp_path / "m.mesh")
         if turned:
-            with pytest.raises(FluxError, match=r"values: 4 values fit the boundary faces.* order is another one"):
+            with pytest.raises(FluxError, match=r"values: 4 values fit the boundary faces.* in another order"):
                 import_flux(tmp_path / "m.mesh", values, per="face")
         else:
             np.testing.assert_array_equal(import_flux(tmp_path / "m.mesh", values, per="face").exitance, values)

@@ -23,7 +23,7 @@ from ...emission.of_emitter import surfaces_of
 from ...jit.mesh_buffers import box_of, is_shaded_smoothly, shading_normals
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
-from ..quadrature import Quadrature
+from ..quadrature import MOST_SPECULAR, Quadrature
 from .glass import Glass
 from .mirror import Mirror, Untraced, index_of
 from .nested_bsdfs import blended_parts
@@ -178,13 +178,12 @@ def lobes_of(bsdf: mi.BSDF) -> tuple[str, ...]:
 
 
 def longest_course(scene: mi.Scene) -> int:
-    """Surfaces on a course that two panes turn back once each: every border of glass three times, every mirror once.
-
-    0 without panes. Light on longer courses is reflected by glass at least four times: with the weight R⁴.
+    """Surfaces on the longest course that glass turns back and on again: every border three times, but for the two that
+    reflect, every mirror once; 0 without glass. More reflections by glass have the weight R⁴ of its borders, or less.
     """
     kinds = [set(lobes_of(bsdf)) for shape in scene.shapes() if (bsdf := specular_bsdf(shape)) is not None]
     borders = sum(2 if "transmission" in lobes else 1 for lobes in kinds if len(lobes) > 1)
-    return 3 * borders + sum(lobes == {"reflection"} for lobes in kinds) if borders else 0
+    return min(3 * borders - 2 + sum(lobes == {"reflection"} for lobes in kinds), MOST_SPECULAR) if borders else 0
 
 
 def _mirror(rough: mi.BSDF) -> mi.BSDF | None:

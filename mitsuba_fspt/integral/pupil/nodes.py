@@ -30,7 +30,7 @@ BOTH = 4 + 12  # lines of sight a pixel of both rules; with fewer allowed only f
 FALLOFF, IN_PIXEL = 0.1, 0.5
 LIGHT_KNOWN = 2.0  # factor to which the light that surfaces send to a pixel is known
 # Error of a node rule over the change of the value from the rule before. Where J_n is rough, both rules have errors of
-# like size, and by chance their change is smaller on some of a thousand pixels (scripts/every_pixel.py).
+# like size, and by chance their change is smaller on a few of a thousand pixels (scripts/every_pixel.py).
 AGREEMENT = 2.0
 TURN_REACH = 2  # pixels around over which the correction `four_turn` is averaged, to leave out the roughness of J_n
 

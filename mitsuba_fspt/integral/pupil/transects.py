@@ -216,7 +216,7 @@ class _Refinement:
         if count >= MANY:
             remaining = dr.maximum(remaining, dr.abs(self.means.value - self.means.plain))
         if level <= node_rules.SMOOTH_LEVELS:
-            # On smooth pixels the next node rule changes the value by less than this one did, but for chance.
+            # On smooth pixels the next node rule mostly changes the value by less than this one did.
             remaining = dr.select(self.smooth, dr.opaque(mi.Float64, AGREEMENT) * change, remaining)
         remaining = dr.select(first_met, self._above_tolerance(remaining), remaining)
         expected = dr.maximum(dr.opaque(mi.Float64, estimator.unexpected) * before, self.draft.tolerance)

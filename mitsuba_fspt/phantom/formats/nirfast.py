@@ -31,9 +31,13 @@ def read_nirfast(mesh: Path) -> RawMesh:
     FluxError : a file is missing or of another layout (TetGen's, or a mesh of triangles).
     """
     stem = mesh.with_suffix("") if mesh.suffix.lower() in (".node", ".elem", ".param") else mesh
+    file = stem.with_name(f"{stem.name}.node")
     try:
-        nodes, _ = read_table(stem.with_name(f"{stem.name}.node"))
-    except FluxError as cause:  # TetGen's first line has as many columns as the others by chance only
+        nodes, _ = read_table(file)
+    except FluxError as cause:
+        if not file.is_file():
+            raise
+        # TetGen's first line has as many columns as the others by chance only
         raise FluxError(f"NIRFAST: {cause} {TETGEN}") from cause
     elements, _ = read_table(stem.with_name(f"{stem.name}.elem"))
     if nodes.shape[1] != 4 or not np.isin(nodes[:, 0], (0, 1)).all():

@@ -131,7 +131,7 @@ def _require_same_order(triangles: Indices, faces: Indices, name: str) -> None:
     if len(triangles) == len(faces) and not np.array_equal(np.sort(triangles, axis=1), np.sort(faces, axis=1)):
         raise FluxError(
             f"{name}: {len(faces)} values fit the boundary faces, tetrahedron by tetrahedron, and the triangles of the "
-            "file, whose order is another one. Give a mesh of the triangles alone, or of the tetrahedra alone."
+            "file, which are in another order. Give a mesh of the triangles alone, or of the tetrahedra alone."
         )
 
 
