@@ -76,6 +76,7 @@ def check_location(rows: Rows) -> list[str]:
     failures += within("sd of the power [%]", float(row["sd_power_percent"]), 0, 0.3)
     for row in rows:  # 60 images a case, the power correlated with x by -0.7: 0.90 ± 3.3 standard errors
         failures += within(f"{row['case']}: share of intervals that contain the value", float(row["holds"]), 0.82, 0.98)
+    failures += within("share of all intervals", sum(float(r["holds"]) for r in rows) / len(rows), 0.87, 0.93)
     return failures
 
 

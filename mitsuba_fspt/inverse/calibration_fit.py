@@ -152,7 +152,7 @@ class CalibrationFit:
         self._images = images
         self._steps = np.ones(len(start))
         self._kept = Slopes(np.full(len(start), np.inf), np.empty(0), np.empty(0), False)  # of no place
-        self._refusal: Exception | None = None  # of the last step that was tried to values without an image
+        self._refusal: Exception | None = None  # of a step from the present values to some without an image
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
@@ -215,7 +215,6 @@ class CalibrationFit:
         except REFUSALS as refusal:
             self._refusal = refusal
             return None
-        self._refusal = None
         return y + step if np.sum(self._residual(image, sigma) ** 2) < before else None
 
     def _residual(self, image: Array, sigma: Array) -> Array:
