@@ -753,6 +753,13 @@ MUTANTS = (
         ("tests/integral/test_honest_error.py",),
     ),
     Mutant(
+        "light of faces beside rough pixels",
+        "integral/pupil/pupil_form.py",
+        "return (self.draft.coverage == 0)",
+        "return (self.draft.coverage < 0)",
+        ("tests/integral/test_honest_error.py",),
+    ),
+    Mutant(
         "sign of the blur of an outline",
         "integral/pupil/transects.py",
         "blur, -self.blur)",

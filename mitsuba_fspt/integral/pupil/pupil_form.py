@@ -48,6 +48,8 @@ FIRST_LINES, BESIDE_NARROW = 70, 600
 # they differ by less is kept: beside a far brighter surface it is more exact.
 ROUNDING = 1e-12
 
+DARK = 0.1  # of the tolerance: less light of faces may stay out where lines of sight meet none
+
 FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
 MARGIN = 0.9  # share of their brightest value that counts, for the error of twelve nodes
 
@@ -136,6 +138,9 @@ class ByFaces(Protocol):
 class _Faces:
     """Gives rough pixels of a draft their value `by_faces`, once; they count as given from then on.
 
+    So do pixels on and around them on which no line of sight has met light, but faces send some: a corner may lie
+    between all lines.
+
     narrow : pixels (h, w) that get it in any case; set to False if the deadline leaves no time for them
     found : the pixels, their values, errors and coverage
     """
@@ -168,17 +173,21 @@ class _Faces:
         if not (wanted | forced).any():
             return rough
         self.taken = True
+        around = draft.grown_by_reach(grid.flat(wanted | forced)) & (draft.coverage == 0)
+        wanted |= grid.array(around) & allowed
         found = self.by_faces.run(wanted | forced, peak, Progress(deadline=draft.progress.deadline))
         self._count(found)
-        return rough & ~self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
+        given, done = self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
+        return (rough | given) & ~done
 
-    def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> Mask:
-        """Set the values, errors and coverage that are better; returns the pixels that are not refined further."""
+    def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> tuple[Mask, Mask]:
+        """Set the values, errors and coverage that are better; returns their pixels and those that are done."""
         draft = self.draft
         power, error, coverage = self._images(found)
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
-        taken = wanted & ((error < draft.error) | forced)
-        done = taken & ((error <= dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest) | forced)
+        tolerance = dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest
+        taken = wanted & ((error < draft.error) | forced | self._unmet(power, tolerance))
+        done = taken & ((error <= tolerance) | forced)
         same = dr.abs(power - draft.value) <= dr.opaque(mi.Float64, ROUNDING) * brightest
         power = dr.select(same, draft.value, power)
         self.found = taken, power, error, coverage
@@ -188,15 +197,19 @@ class _Faces:
         )
         draft.computed &= ~done
         dr.eval(draft.value, draft.error, draft.given, draft.given_error, draft.computed)
-        return done
+        return taken, done
+
+    def _unmet(self, power: PixelArray, tolerance: PixelArray) -> Mask:
+        """Pixels on which no line of sight has met the light that faces send: the error of these is none."""
+        return (self.draft.coverage == 0) & (power > dr.opaque(mi.Float64, DARK) * tolerance)
 
     def further(self) -> None:
         """Before lattices: the values of faces again where those of transects have larger errors, refined further."""
         draft, grid = self.draft, self.draft.grid
         if self.found is None:
             return
-        taken, _, error, _ = self.found
-        self._set(taken & draft.computed & (error < draft.error))
+        taken, power, error, _ = self.found
+        self._set(taken & draft.computed & ((error < draft.error) | self._unmet(power, draft.tolerance)))
         left = grid.array(taken & draft.shown & (draft.error > draft.tolerance))
         if not left.any() or draft.progress.deadline.passed():
             return
