@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FIRST, FITS, LAST, TIFF, read_frame
+from ..images.frame_file import FIRST, FITS, LAST, TIFF, read_frame, tell_open_rows
 from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
@@ -103,17 +103,16 @@ def tell_time(counts: Counts, given: float) -> None:
 
 def tell_rows(counts: Counts) -> None:
     """Say in one line on stderr that the file of the counts does not state which of its rows is the top one."""
-    if counts.top_row is None:
-        LOG.warning(
-            "fspt: reduce: the FITS file of the counts has no ROWORDER of TOP-DOWN or BOTTOM-UP; its first row is "
-            "taken for the top one. If the image is upside down, set ROWORDER = BOTTOM-UP in all frames of this camera."
-        )
+    tell_open_rows("reduce: the FITS file of the counts", counts.top_row, "in all frames of this camera")
 
 
-def require_same_rows(name: str, frame: Counts, counts: Counts) -> None:
-    """Raise DetectorError if of the frame `name` and the counts one is turned and the other does not state its rows."""
-    if {frame.top_row, counts.top_row} == {LAST, None}:
-        silent, turned = (name, "counts") if frame.top_row is None else ("counts", name)
+def require_same_rows(name: str, top_row: str | None, other: str, others: str | None) -> None:
+    """Raise DetectorError if of two files one is turned and the other does not state which row is the top one.
+
+    name, other : what they are, such as 'bias' and 'counts';  top_row, others : their `top_row`
+    """
+    if {top_row, others} == {LAST, None}:
+        silent, turned = (name, other) if top_row is None else (other, name)
         raise DetectorError(
             f"reduce: '{silent}' has no ROWORDER, '{turned}' is BOTTOM-UP. Their rows would not match: set ROWORDER in "
             "both FITS files."

@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter
 
+from ..images.frame_file import FIRST
 from ..images.radiometry import etendue_of
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
-from .counts import Counts, Frame, frame_like, require_same_time
+from .counts import Counts, Frame, frame_like, require_same_rows, require_same_time
 from .parameters import DetectorParameters
 from .saturation import full_pixels
 from .stray_light import Spread
@@ -57,18 +58,22 @@ class FlatField:
     error : relative standard error of f (h, w) by shot and read noise; None for a single frame, whose number of frames
         is unknown, and for a map
     kind : 'lens', 'sensor' or, of the detector's own map, 'map'
+    top_row : of its file, as of `Counts`
     """
 
     response: Array
     mask: Mask
     error: Array | None
     kind: str
+    top_row: str | None = FIRST
 
     @classmethod
     def of_map(cls, detector: DetectorParameters, shape: tuple[int, ...]) -> FlatField | None:
         """Response by the map `prnu` of a detector; None without one."""
         response = detector.response(shape)
-        return None if response is None else cls(response, np.zeros(shape, bool), None, "map")
+        if response is None:
+            return None
+        return cls(response, np.zeros(shape, bool), None, "map", detector.maps["prnu"].top_row)
 
 
 def flat_field(
@@ -98,6 +103,7 @@ def flat_field(
     """
     _require_kind(kind, scene)
     found = frame_like(flat, "flat", shape)
+    require_rows_of_maps(detector, "flat", found)
     spurious = detector.spurious_charge * area * detector.em_gain / detector.on_pixels("gain", shape)
     level = detector.on_pixels("bias", shape) + spurious if bias is None else bias  # a frame contains that charge
     background, frames = _background(detector, found, flat_dark, level, shape)
@@ -120,7 +126,16 @@ def flat_field(
     usable &= relative <= HOT * median_filter(filled, NEIGHBOURS, mode="nearest")
     response = np.where(usable, relative / relative[usable].mean(), 1.0)
     error = _error(detector, np.where(usable, electrons, 1.0), found.frames, frames) if _is_in_dn(found) else None
-    return FlatField(response, ~usable, error, str(kind))
+    return FlatField(response, ~usable, error, str(kind), found.top_row)
+
+
+def require_rows_of_maps(detector: DetectorParameters, name: str, counts: Counts) -> None:
+    """Raise DetectorError for a map of the detector whose order of rows may be another one than that of counts.
+
+    name : of the counts, for messages
+    """
+    for own, pixels in detector.maps.items():
+        require_same_rows(own, pixels.top_row, name, counts.top_row)
 
 
 def tell_loss(field: FlatField, gain_error: float) -> None:
@@ -207,6 +222,7 @@ def _background(
                 raise DetectorError(f"reduce: 'flat_dark' must be >= 0 DN, got {level:g}. Give 0 for a flat without.")
             return level, np.inf
         frame = frame_like(flat_dark, "flat_dark", shape)
+        require_same_rows("flat_dark", frame.top_row, "flat", flat.top_row)
         require_same_time("flat_dark", frame, "flat", flat.exposure_time)
         return frame.values, frame.frames
     if flat.raw:

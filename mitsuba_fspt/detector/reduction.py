@@ -47,7 +47,7 @@ from .counts import (
     tell_unequal_frames,
 )
 from .dark_charge import Background, shown_charge
-from .flat_field import FlatField, flat_field, require_no_flat, tell_loss
+from .flat_field import FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .saturation import full_pixels, saturated
 
@@ -155,10 +155,15 @@ class Corrections:
                     f"reduce: 'flat' has the shape {self.flat.response.shape}, the counts {shape}. Give a frame of the "
                     "same film."
                 )
+            require_same_rows("flat", self.flat.top_row, "counts", counts.top_row)
             return self.flat
-        bias = counts.bias if self.bias is None else frame_like(self.bias, "bias", shape).values
         flat = frame_of(self.flat, "flat")
-        require_same_rows("flat", flat, counts)
+        require_same_rows("flat", flat.top_row, "counts", counts.top_row)
+        bias = counts.bias
+        if self.bias is not None:
+            empty = frame_like(self.bias, "bias", shape)
+            require_same_rows("bias", empty.top_row, "flat", flat.top_row)
+            bias = empty.values
         found = flat_field(
             detector,
             flat,
@@ -184,7 +189,7 @@ class Corrections:
             given = np.asarray(given)
             given = given.astype(np.uint8) if given.dtype == bool else given
         found = frame_like(given, "bad_pixels", shape)
-        require_same_rows("bad_pixels", found, counts)
+        require_same_rows("bad_pixels", found.top_row, "counts", counts.top_row)
         return found.values != 0
 
 
@@ -221,6 +226,7 @@ def reduce_counts(
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
     tell_time(raw, exposed.exposure_time)
     tell_rows(raw)
+    require_rows_of_maps(detector, "counts", raw)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
@@ -346,7 +352,7 @@ def _background(
     given = raw.bias if bias is None else bias
     empty = None if given is None else frame_like(given, "bias", shape)  # without dark charge
     if empty is not None:
-        require_same_rows("bias", empty, raw)
+        require_same_rows("bias", empty.top_row, "counts", raw.top_row)
     zero = detector.on_pixels("bias", shape)
     noise: Array | float = 0.0  # variance of the bias frame
     if empty is not None:
@@ -360,7 +366,7 @@ def _background(
     frame = raw.background if dark is None and raw.background is not None else dark
     if frame is not None:
         found = frame_like(frame, "dark", shape)
-        require_same_rows("dark", found, raw)
+        require_same_rows("dark", found.top_row, "counts", raw.top_row)
         require_same_time("dark", found, "counts", exposed.exposure_time)
         shown = gain * (found.values - zero)
         charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)

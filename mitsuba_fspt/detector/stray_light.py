@@ -22,7 +22,7 @@ from scipy.signal import convolve
 
 from ..images.comparison import GLARE, PSF
 from ..images.formats import Metadata, read_planes
-from ..images.frame_file import FITS, read_frame
+from ..images.frame_file import FIRST, FITS, read_frame, tell_open_rows
 from ..images.pixel_axes import CROP
 from ..images.recorded_number import recorded_number, recorded_positive
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
@@ -117,6 +117,7 @@ def _content(path: Path, thing: str) -> tuple[NDArray[Any], float | None]:
         raise
     except FsptError as cause:
         raise DetectorError(str(cause)) from cause
+    tell_open_rows(thing, header.get("top_row", FIRST))
     return values, header.get("pixel_pitch")
 
 

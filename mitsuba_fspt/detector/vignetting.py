@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from ..images.formats import Metadata, write_planes
+from ..images.frame_file import tell_open_rows
 from ..optics.vignetting import VIGNETTING
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
-from .counts import Counts, Frame, frame_like, frame_of
+from .counts import Counts, Frame, frame_like, frame_of, require_same_rows
 from .flat_field import LEAST, FlatField, flat_field, uniform_screen
 from .parameters import DetectorParameters
 from .stray_light import Spread
@@ -85,10 +86,12 @@ class MeasuredVignetting:
         found = frame_of(flat, "flat")
         known, shape = UNKNOWN if detector is None else detector, (film[0], film[1])
         _require_bias(detector, found, flat_dark)
+        tell_open_rows("reduce: the FITS file of the flat", found.top_row, "in all frames of this camera")
         of_lens = flat_field(known, frame_like(found, "flat", shape), "lens", scene, shape, flat_dark=flat_dark)
         ratio, good = of_lens.response, ~of_lens.mask
         if sensor_flat is not None:
             response = _sensor_flat(known, detector, sensor_flat, flat_dark, shape)
+            require_same_rows("sensor_flat", response.top_row, "flat", found.top_row)
             ratio, good = ratio / response.response, good & ~response.mask
         if not good.any():
             raise DetectorError("reduce: no pixel is usable in both flats. Give flats that do not saturate.")

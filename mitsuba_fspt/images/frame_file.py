@@ -50,6 +50,21 @@ def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
         raise ImageError(f"{thing}: no NPY file of numbers: {one_line(cause, LONGEST_TEXT)}. Save it again.") from cause
 
 
+def tell_open_rows(thing: str, top_row: str | None, where: str = "in its header") -> None:
+    """Say in one line on stderr that a FITS file, the `thing`, does not state which of its rows is the top one.
+
+    where : headers in which the user states it
+    """
+    if top_row is None:
+        LOG.warning(
+            "fspt: %s has no ROWORDER of TOP-DOWN or BOTTOM-UP; its first row is taken for the top one. If the image "
+            "is upside down, set ROWORDER = %s %s.",
+            thing,
+            BOTTOM_UP,
+            where,
+        )
+
+
 def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Data of the first image of a FITS file, of two axes or more, row 0 at the top, and what its header states; others
     are told.
@@ -93,7 +108,12 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
         data = np.where(empty, np.nan, data)
     found = _stated(header, thing)
     if found["top_row"] == LAST:
-        LOG.warning("fspt: %s: its first row is the lowest one (ROWORDER = %s); it is turned.", thing, BOTTOM_UP)
+        LOG.warning(
+            "fspt: %s: its first row is the lowest one (ROWORDER = %s); it is turned. Turn frames without a header, "
+            "such as arrays and .npy, likewise.",
+            thing,
+            BOTTOM_UP,
+        )
         data = np.flip(data, axis=-2)
     return data, found
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import DetectorError, FsptError
-from .frame_file import read_frame
+from .frame_file import FIRST, read_frame
 from .recorded_number import recorded_number
 
 Array = NDArray[np.float64]
@@ -26,11 +26,13 @@ class PixelMap:
     """Values (h, w) of a parameter on the pixels read out, row 0 at the top.
 
     path : absolute name of the file;  digest : first digits of its SHA-256
+    top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
     """
 
     path: str
     digest: str
     values: Array
+    top_row: str | None = FIRST
 
     @classmethod
     def read(cls, path: str | Path, thing: str) -> PixelMap:
@@ -46,7 +48,7 @@ class PixelMap:
         if not path.is_file():
             raise DetectorError(f"{named} does not exist. Give a number, or the name of a .tif, .fits or .npy file.")
         try:
-            array, _ = read_frame(path, named)
+            array, header = read_frame(path, named)
         except ImportError:
             raise
         except FsptError as cause:
@@ -62,7 +64,8 @@ class PixelMap:
                 "mask such pixels by 'bad_pixels'."
             )
         values.flags.writeable = False
-        return cls(str(path), hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS], values)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
+        return cls(str(path), digest, values, header.get("top_row", FIRST))
 
     def on(self, shape: tuple[int, ...], thing: str) -> Array:
         """The values, if they are of this shape (h, w); else DetectorError."""

@@ -14,7 +14,7 @@ from ..optics.curve_file import read_rows
 from ..optics.vignetting import DIGEST, VIGNETTING, Vignetting
 from ..runtime.errors import BackendError, FsptError, OpticsError
 from .formats import Metadata, read_planes
-from .frame_file import read_frame
+from .frame_file import FIRST, read_frame, tell_open_rows
 from .pixel_axes import CROP
 from .recorded_number import recorded_number
 
@@ -73,10 +73,12 @@ def _plane(path: Path) -> tuple[np.ndarray[Any, np.dtype[np.float64]], Metadata]
     metadata: Metadata = {}
     named = f"'{VIGNETTING}' = '{path}'"
     try:
-        values = read_frame(path, named)[0] if path.suffix.lower() in FRAMES else None
+        values, header = read_frame(path, named) if path.suffix.lower() in FRAMES else (None, {})
         if values is None or (values.ndim > 2 and path.suffix.lower() != ".npy"):
             planes, metadata = read_planes(path)
             values = planes.get(VIGNETTING, next(iter(planes.values())))
+        else:
+            tell_open_rows(named, header.get("top_row", FIRST))
     except BackendError:
         raise
     except FsptError as cause:

@@ -12,11 +12,13 @@ import pytest
 from small_scenes import camera_scene, disk
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.detector.counts import read_counts
 from mitsuba_fspt.detector.detector import Detector
-from mitsuba_fspt.detector.reduction import calibrated, read_measured, reduced
+from mitsuba_fspt.detector.reduction import Corrections, Exposed, calibrated, read_measured, reduce_counts, reduced
 from mitsuba_fspt.images.comparison import compare
 from mitsuba_fspt.images.image import Image, read
 from mitsuba_fspt.images.noise_model import NoiseModel
+from mitsuba_fspt.optics.light import Light
 from mitsuba_fspt.optics.thin_lens import Lens
 from mitsuba_fspt.optics.uniform_source import uniform_power
 from mitsuba_fspt.runtime.errors import DetectorError, ImageError
@@ -295,8 +297,6 @@ def test_files(tmp_path):
     (click / "ClickInfo.txt").write_text("Camera:\tIVIS\nLuminescent Exposure Seconds:\t60\n")
     pytest.importorskip("ccdproc")
     np.testing.assert_allclose(CCD.reduce(click, **SETTINGS).power, expected, atol=1e-22)
-    from mitsuba_fspt.detector.counts import read_counts
-
     assert read_counts(click).exposure_time == 60
 
 
@@ -320,8 +320,6 @@ def test_rows_of_fits_files(tmp_path, caplog):
     One line says that rows are turned, or that the header leaves it open. Seen to fail: neither was told.
     """
     fits = pytest.importorskip("astropy.io.fits")
-    from mitsuba_fspt.detector.counts import read_counts
-
     counts = np.arange(12, dtype=np.uint16).reshape(3, 4)
     for order, rows in (("TOP-DOWN", counts), ("BOTTOM-UP", counts[::-1])):
         hdu = fits.PrimaryHDU(counts)
@@ -358,12 +356,46 @@ def test_frames_of_another_order_of_rows_than_the_counts_are_refused(tmp_path, n
         CCD.reduce(files["counts"], exposure_time=60, wavelength_nm=650, **{name: files["frame"]}, **kind)
 
 
+@pytest.mark.parametrize("name", ["read_noise", "flat_dark", "second counts"])
+def test_maps_and_frames_of_frames_have_the_rows_of_their_counts(tmp_path, caplog, name):
+    """A map of the detector, the dark of a flat, and a flat of counts that are no longer the first ones.
+
+    Of each pair one is turned and the other does not state its rows. Seen to fail: none was refused. Turned both, they
+    give what untouched ones give.
+    """
+    fits, _ = pytest.importorskip("astropy.io.fits"), pytest.importorskip("ccdproc")
+    counts, frame = np.arange(900, 912, dtype=np.uint16).reshape(3, 4), np.arange(600, 612.0).reshape(3, 4)
+
+    def file(values, *, turned):
+        kind = "turned" if turned else "open"
+        hdu = fits.PrimaryHDU(values[::-1] if turned else values)
+        if turned:
+            hdu.header["ROWORDER"] = "BOTTOM-UP"
+        hdu.writeto(path := tmp_path / f"{kind}{values[0, 0]:g}.fits", overwrite=True)
+        return path
+
+    def reduced_by(turned, other):
+        light, frames = (file(values, turned=turned) for values in (counts, frame.astype(np.uint16)))
+        if name == "read_noise":
+            return replace(CCD, read_noise=file(frame, turned=other)).reduce(light, **SETTINGS).error
+        if name == "flat_dark":
+            dark = {"flat": frames, "flat_dark": file(frame - 500, turned=other), "flat_kind": "sensor"}
+            return CCD.reduce(file(counts, turned=turned), **SETTINGS, **dark).power
+        applied = Corrections(flat=frames, flat_kind="sensor", flat_dark=0)
+        exposed = Exposed(60, Light(650, None))
+        applied = replace(applied, flat=applied.flat_field(CCD, read_counts(light), exposed))
+        return reduce_counts(CCD, read_counts(file(counts, turned=other)), exposed, applied).power
+
+    for turned in (True, False):
+        with pytest.raises(DetectorError, match=r"has no ROWORDER, '.*' is BOTTOM-UP"):
+            reduced_by(turned, not turned)
+    np.testing.assert_array_equal(reduced_by(True, True), reduced_by(False, False))
+
+
 @pytest.mark.parametrize("wrong", ["60.0 s", "", "inf"])
 def test_a_keyword_that_is_no_number_is_left_out(tmp_path, caplog, wrong):
     """Of an exposure time and a binning. Seen to fail: the file was refused as damaged, with the fix to copy it."""
     fits = pytest.importorskip("astropy.io.fits")
-    from mitsuba_fspt.detector.counts import read_counts
-
     header = fits.Header({"EXPTIME": wrong, "XBINNING": wrong, "XPIXSZ": 13.5})
     fits.PrimaryHDU(np.ones((3, 4), np.uint16), header).writeto(tmp_path / "a.fits")
     found = read_counts(tmp_path / "a.fits")
@@ -374,8 +406,6 @@ def test_a_keyword_that_is_no_number_is_left_out(tmp_path, caplog, wrong):
 def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):
     """Counts of 16 bits without a sign, of which one is BLANK. Seen to fail: 32775 DN of light on that pixel."""
     fits = pytest.importorskip("astropy.io.fits")
-    from mitsuba_fspt.detector.counts import read_counts
-
     hdu = fits.PrimaryHDU(np.arange(12, dtype=np.uint16).reshape(3, 4) + 32768)
     hdu.writeto(tmp_path / "a.fits")
     for blank, held in ((99, False), (7, True)):
@@ -408,8 +438,6 @@ def test_images_of_this_package_are_no_counts(tmp_path, suffix):
 def test_click_info_of_the_luminescent_image(tmp_path):
     """Exposure and binning are those of its own section; photograph and bias frame, with others, come first."""
     tifffile = pytest.importorskip("tifffile")
-    from mitsuba_fspt.detector.counts import read_counts
-
     tifffile.imwrite(tmp_path / "luminescent.TIF", np.full((4, 4), 1000, np.uint16))
     photo = "*** photographic image:\tphotograph.TIF\nBinning Factor:\t2\nExposure Time Sec:\t0.2\n"
     bias = "*** readbiasonly image:\treadbiasonly.TIF\nBinning Factor:\t16\nBackground Exposure (Seconds):\t0\n"

@@ -165,6 +165,12 @@ def test_fits_as_astropy_reads_it(written):
     assert (header["CUNIT1"], header["ROWORDER"]) == ("mm", "TOP-DOWN")
     last = [header[f"CRVAL{k}"] + header[f"CDELT{k}"] * (size - header[f"CRPIX{k}"]) for k, size in ((1, 7), (2, 5))]
     assert last == pytest.approx([3 * SIDE, -2 * SIDE])
+    with astropy.io.fits.open(path, mode="update") as file:
+        for hdu in file[:3]:
+            hdu.data, hdu.header["ROWORDER"] = hdu.data[::-1].copy(), "BOTTOM-UP"
+    read = fspt.read(path)  # turned, as another program may write it; seen to fail: upside down
+    np.testing.assert_array_equal(read.power, original.power.astype(np.float32))
+    np.testing.assert_array_equal(read.coverage, original.coverage.astype(np.float32))
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from ..pixel_axes import PixelAxes
 from . import Format, Metadata, Planes, units
 
 TABLE = "METADATA"
+ROW_ORDER, TOP_DOWN, BOTTOM_UP = "ROWORDER", "TOP-DOWN", "BOTTOM-UP"
 UNITS = {  # as the standard spells them
     "1": "",
     "e-": "electron",
@@ -60,7 +62,7 @@ class Fits(Format):
             hdu = fits.ImageHDU(planes[name]) if hdus else fits.PrimaryHDU(planes[name])
             hdu.header["EXTNAME"] = name.upper()
             hdu.header["BUNIT"] = UNITS.get(unit, unit)
-            hdu.header["ROWORDER"] = "TOP-DOWN"
+            hdu.header[ROW_ORDER] = TOP_DOWN
             for number, (letter, positions) in enumerate((("X", axes.x), ("Y", axes.y)), 1):
                 hdu.header[f"CTYPE{number}"], hdu.header[f"CUNIT{number}"] = letter, axes.unit
                 hdu.header[f"CRPIX{number}"], hdu.header[f"CRVAL{number}"] = 1.0, float(positions[0])
@@ -86,8 +88,14 @@ class Fits(Format):
             table = hdus[TABLE].data
             metadata = {str(key): json.loads(value) for key, value in zip(table[KEY], table[VALUE], strict=True)}
             images = [hdu for hdu in hdus if hdu.name != TABLE and hdu.data is not None]
-            planes = {hdu.name.lower(): np.ascontiguousarray(hdu.data, np.float32) for hdu in images}
+            planes = {hdu.name.lower(): np.ascontiguousarray(_top_down(hdu), np.float32) for hdu in images}
         return planes, metadata
+
+
+def _top_down(hdu: Any) -> NDArray:
+    """Data of an HDU (h, w), row 0 at the top: turned where another program has written ROWORDER = BOTTOM-UP."""
+    turned = str(hdu.header.get(ROW_ORDER, "")).strip().upper() == BOTTOM_UP
+    return np.flip(hdu.data, axis=-2) if turned else hdu.data
 
 
 def _cards(metadata: Metadata) -> dict[str, tuple[str | int | float, str]]:
