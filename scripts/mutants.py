@@ -252,8 +252,8 @@ MUTANTS = (
     Mutant(
         "vignetting of the etendue map",
         "images/radiometry.py",
-        "whole * _shares(vignetting, shape, known)",
-        "whole",
+        "etendues * _shares(vignetting, shape, known)",
+        "etendues",
         (VIGNETTING,),
     ),
     Mutant(

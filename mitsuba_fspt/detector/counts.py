@@ -25,6 +25,8 @@ LOG = logging.getLogger("mitsuba_fspt")
 # frames have not the same light. Lamps drift by less; a wrong exposure time is a factor, mostly.
 UNEQUAL, UNEQUAL_BY_NOISE, UNEQUAL_BY_DRIFT = 0.2, 10.0, 1.0
 BRIGHT = 99.9  # percentile at which the pixels of a frame are cut off for its mean: cosmic rays are no light
+DN = ("", "dn", "adu", "count", "counts", "ct")  # names of it in BUNIT
+WRAPPED = -(2**14)  # DN of 16 bits with a sign: lower ones are no dark counts, but wrapped ones of 32768 … 49151
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -53,6 +55,7 @@ class Counts:
     binning : side of the square of pixels read out as one, None if the file does not state it
     pixel_pitch : of the pixels read out [mm], None if the file does not state it
     top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
+    unit : of the values by the file, None if it does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
     """
 
@@ -69,6 +72,7 @@ class Counts:
     pixel_pitch: float | None = None
     levels: NDArray[np.float64] | None = None
     top_row: str | None = FIRST
+    unit: str | None = None
 
 
 def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:
@@ -98,6 +102,16 @@ def tell_time(counts: Counts, given: float) -> None:
             "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
             given,
             stated,
+        )
+
+
+def tell_unit(counts: Counts) -> None:
+    """Say in one line on stderr that the values are taken for DN where the file states another unit."""
+    if counts.unit is not None and counts.unit.lower() not in DN:
+        LOG.warning(
+            "fspt: reduce: the file of the counts states the unit '%s' (BUNIT); its values are taken for DN. Give raw "
+            "counts, or correct BUNIT.",
+            counts.unit,
         )
 
 
@@ -191,6 +205,11 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
             f"counts '{name}' must be real numbers of shape (h, w) or (frames, h, w), got {array.dtype} of shape "
             f"{array.shape}. Save one channel of grey values."
         )
+    if array.dtype.kind == "i" and array.dtype.itemsize == 2 and (lowest := int(array.min())) < WRAPPED:
+        raise ImageError(
+            f"counts '{name}' of 16 bits with a sign go down to {lowest}: those above 32767 have lost 65536. Save them "
+            "without a sign, in FITS with BZERO = 32768."
+        )
     stack = array.astype(np.float64)
     if not np.isfinite(stack).all():
         raise ImageError(f"counts '{name}' hold {int(np.sum(~np.isfinite(stack)))} NaN or inf. Mask or replace them.")
@@ -257,6 +276,8 @@ def _click(folder: Path) -> Counts:
     light = _click_counts(files[CLICK])
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
+    if binning is not None and not (binning >= 1 and binning == int(binning)):
+        raise ImageError(f"'{files[INFO]}' states a binning of {binning:g}, no whole number >= 1. Correct it.")
     sides = None if binning is None else int(binning)
     bias, background = found.get(BIAS), found.get(BACKGROUND)
     return replace(light, bias=bias, background=background, exposure_time=time, info=info, binning=sides)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter
 
-from ..images.frame_file import FIRST
+from ..images.frame_file import FIRST, SAME_PITCH
 from ..images.radiometry import etendue_of
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
@@ -46,7 +46,6 @@ SMOOTHED = 8  # squares of the shorter side over this show what a lens loses, wh
 CHANCE = 4.0  # standard deviations of a mean over pixels: more is no noise
 LOSS = 0.02  # by which the mean response may lie below the largest smooth one without a word
 NORMALISED = 2.0  # largest median of a flat that was divided by its mean before; that of DN is larger
-SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,7 @@ from .counts import (
     tell_rows,
     tell_time,
     tell_unequal_frames,
+    tell_unit,
 )
 from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
@@ -225,6 +226,7 @@ def reduce_counts(
     if exposed.pixel_pitch is None and detector.pixel_pitch is None:
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
     tell_time(raw, exposed.exposure_time)
+    tell_unit(raw)
     tell_rows(raw)
     require_rows_of_maps(detector, "counts", raw)
     shape = raw.values.shape
@@ -290,7 +292,7 @@ def reduced(exposure: Exposure) -> Image:
     exposed = Exposed(
         found["exposure_time"],  # type: ignore[arg-type]
         light,  # type: ignore[arg-type]  # there is one
-        int(recorded("binning", 1)),
+        recorded("binning", 1),  # type: ignore[arg-type]  # checked there
         recorded_positive(found, "pixel_pitch", "reduce: the exposure", DetectorError),
     )
     detector = replace(detector, gain_error=recorded("gain_error", 0.0))

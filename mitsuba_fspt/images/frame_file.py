@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,24 @@ LOG = logging.getLogger("mitsuba_fspt")
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 UM_PER_MM = 1e3
 ROW_ORDER, BOTTOM_UP = "ROWORDER", "BOTTOM-UP"
-KEYWORDS = ("EXPTIME", "EXPOSURE", "XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ", ROW_ORDER)  # of FITS headers
+UNIT = "BUNIT"
+# Of FITS headers: numbers, each with its rule for messages and whether a value keeps it; and texts.
+NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    **dict.fromkeys(("EXPTIME", "EXPOSURE"), ("number >= 0 of seconds", lambda v: v >= 0)),
+    **dict.fromkeys(("XBINNING", "YBINNING"), ("whole number >= 1", lambda v: v >= 1 and v == int(v))),
+    **dict.fromkeys(("XPIXSZ", "YPIXSZ"), ("number > 0 of um", lambda v: v > 0)),
+}
+KEYWORDS = (*NUMBERS, ROW_ORDER, UNIT)
+SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
 FIRST, LAST = "first", "last"  # which row of a file is the top one
 
 
 def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Array of a .tif, .fits or .npy file as it is stored, row 0 at the top, and what a FITS header states.
 
-    The header's entries are `exposure_time` [s], `binning` and `pixel_pitch` [mm], as far as it has them, and
-    `top_row`, the row of the file that is the top one: 'first' or 'last', None if the header does not say it.
+    The header's entries are `exposure_time` [s], `binning`, `pixel_pitch` [mm] and `unit` of the values, as far as it
+    has them, and `top_row`, the row of the file that is the top one: 'first' or 'last', None if the header does not say
+    it.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -123,27 +133,33 @@ def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
 
     Raises ImageError for pixels that are not squares of the sensor's.
     """
-    numbers = {key: _number(value, key, thing) for key, value in header.items() if key != ROW_ORDER}
-    sides, rows, wide, high = (numbers[key] for key in ("XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ"))
-    if None not in (sides, rows) and sides != rows:
-        raise ImageError(f"{thing}: binned {sides:g} x {rows:g}. Give a frame of square binning.")
+    numbers = {key: _number(header[key], key, thing) for key in NUMBERS}
+    columns, rows, wide, high = (numbers[key] for key in ("XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ"))
+    if columns and rows and columns != rows:
+        raise ImageError(f"{thing}: binned {columns:g} x {rows:g}. Give a frame of square binning.")
+    if wide and high and abs(wide - high) > SAME_PITCH * high:
+        raise ImageError(f"{thing}: has pixels of {wide:g} x {high:g} um. Give a frame of square pixels.")
+    sides, pitch = columns or rows, wide or high
     order = str(header[ROW_ORDER]).strip().upper()
     found: dict[str, Any] = {"top_row": {"TOP-DOWN": FIRST, BOTTOM_UP: LAST}.get(order)}
     time = numbers["EXPOSURE"] if numbers["EXPTIME"] is None else numbers["EXPTIME"]
     found |= {} if time is None else {"exposure_time": time}
     found |= {} if sides is None else {"binning": int(sides)}
-    return found | ({} if wide is None or high not in (None, wide) else {"pixel_pitch": wide / UM_PER_MM})
+    found |= {} if header[UNIT] is None else {"unit": str(header[UNIT]).strip()}
+    return found | ({} if pitch is None else {"pixel_pitch": pitch / UM_PER_MM})
 
 
 def _number(value: object, key: str, thing: str) -> float | None:
-    """The value of a keyword as a number; None for one that is missing or, which is told, none."""
+    """The value of a keyword of `NUMBERS`; None for one that is missing or, which is told, none of its rule."""
     if value is None:
         return None
+    rule, holds = NUMBERS[key]
     try:
-        found = float(value)  # type: ignore[arg-type]  # a text may be a number
+        found = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]  # a text may be a number
     except (TypeError, ValueError):
         found = math.nan
-    if math.isfinite(found):
+    if math.isfinite(found) and holds(found):
         return found
-    LOG.warning("fspt: %s: %s = %s is no number; it is left out.", thing, key, one_line(repr(value), LONGEST_TEXT))
+    text = one_line(repr(value), LONGEST_TEXT)
+    LOG.warning("fspt: %s: %s = %s is no %s; it is left out. Correct it, or give the number.", thing, key, text, rule)
     return None

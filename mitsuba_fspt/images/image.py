@@ -113,7 +113,7 @@ class Image(ImageData):
         watt = required_source_power(source_power)
         if "source_power" in self.metadata:
             raise ImageError(
-                f"image: 'source_power' is {self.metadata['source_power']:g} W already, got {watt:g} W. "
+                f"image: 'source_power' is {self.metadata['source_power']} W already, got {watt:g} W. "
                 "Leave it out, or render the image without it."
             )
         error = None if self.error is None else self.error.astype(np.float64) * watt

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..runtime.errors import ImageError
 from .formats import BESIDE, Metadata
+from .recorded_number import recorded_number
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,7 +77,7 @@ class ImageData:
     def electrons_per_watt(self) -> float | None:
         """Photoelectrons per watt on a pixel, before an electron-multiplying register, of an image that
         `Detector.reduce` made; None of any other."""
-        return self._recorded("electrons_per_watt")
+        return self._recorded("electrons_per_watt", "> 0", lambda v: v > 0)
 
     @property
     def read_noise(self) -> float | None:
@@ -82,16 +85,20 @@ class ImageData:
 
         Of a map, it is the root mean square.
         """
-        return self._recorded("read_noise")
+        return self._recorded("read_noise", ">= 0 e-", lambda v: v >= 0)
 
     @property
     def gain_error(self) -> float | None:
         """Relative uncertainty common to all pixels, of an image that `Detector.reduce` made; None of any other."""
-        return self._recorded("gain_error")
+        return self._recorded("gain_error", "in [0, 1)", lambda v: 0 <= v < 1)
 
-    def _recorded(self, name: str) -> float | None:
-        value = self.metadata.get(name)
-        return None if value is None else float(value)
+    def _recorded(self, name: str, rule: str, holds: Callable[[float], bool]) -> float | None:
+        """A number of the metadata; ImageError for one that does not keep the rule."""
+        if self.metadata.get(name) is None:
+            return None
+        if not holds(found := recorded_number(self.metadata, name, math.nan)):
+            raise ImageError(f"image: '{name}' of the metadata must be {rule}, got {found:g}. Correct it.")
+        return found
 
 
 def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -66,10 +66,11 @@ class NoiseModel:
             for name, default in (("electrons_per_watt", 0.0), *zip(NUMBERS, (0.0, 0.0, 1.0, 0.0), strict=True))
         )
         read, dark, excess, prnu = others
-        if not (0 < per_watt < math.inf and 0 <= read < math.inf and 0 <= dark < math.inf and excess >= 1):
+        finite = all(map(math.isfinite, (per_watt, read, dark, excess, prnu)))
+        if not (finite and per_watt > 0 and min(read, dark, prnu) >= 0 and excess >= 1):
             raise ImageError(
                 f"{thing} has {per_watt:g} electrons a watt, {read:g} electrons of read noise, {dark:g} e-² of dark "
-                f"current and an excess noise of {excess:g}. Reduce it again from its counts."
+                f"current, an excess noise of {excess:g} and a PRNU of {prnu:g}. Reduce it again from its counts."
             )
         each = np.full(image.shape, per_watt) if image.flat is None else per_watt * image.flat.astype(np.float64)
         noise = math.hypot(read, math.sqrt(dark)) if image.dark_noise is None else image.dark_noise.astype(np.float64)

@@ -68,6 +68,11 @@ def _film(metadata: Mapping[str, object], name: str, count: int) -> float:
 
 
 def virtual_pitch(metadata: Mapping[str, object]) -> float | None:
-    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown."""
-    pitch, magnification = (recorded_positive(metadata, key) for key in ("pixel_pitch", "magnification"))
+    """Side of a pixel [mm] on the virtual detector plane, on the detector without a magnification; None if unknown.
+
+    Other programs give the inverted image on a film a magnification < 0, whose sign says nothing about sizes: pictures
+    are upright here. 0, of an object at infinity, is as none.
+    """
+    pitch = recorded_positive(metadata, "pixel_pitch")
+    magnification = abs(recorded_number(metadata, "magnification", 0.0))
     return None if pitch is None else pitch / (magnification or 1.0)

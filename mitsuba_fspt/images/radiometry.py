@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from ..optics.pixel_etendue import pixel_etendues
 from ..optics.thin_lens import Lens, number_names
 from ..optics.vignetting import Vignetting
 from ..runtime.errors import ImageError, OpticsError
+from ..runtime.numbers import whole
 from .formats import Metadata, write_planes
 from .image_data import ImageData
 from .pixel_axes import CROP, PixelAxes
@@ -103,19 +105,23 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
     names = [name for name in number_names() if name in known and name not in DERIVED]
     try:
         lens = Lens.focused(
-            float(known["focal_length"]),
+            recorded_number(known, "focal_length", math.nan),
             model=str(known.get("model", "diaphragm")),
             distortion=known.get("distortion"),
-            **{name: float(known[name]) for name in names},  # type: ignore[arg-type]
+            **{name: recorded_number(known, name, math.nan) for name in names},  # type: ignore[arg-type]
         )
     except (OpticsError, TypeError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause
     axes = PixelAxes.of(shape, known | {"magnification": lens.magnification})
     passed, pixel = recorded_number(known, "transmittance", 1.0), str(known.get("pixel", "area"))
-    whole = pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)
+    if not 0 < passed <= 1:
+        raise ImageError(
+            f"image: 'transmittance' of the metadata must be > 0 and at most 1, got {passed:g}. Correct it."
+        )
+    etendues = pixel_etendues(lens, axes.step, axes.x, -axes.y, passed, pixel)
     try:
         vignetting = recorded_vignetting(known)
-        return whole if vignetting is None else whole * _shares(vignetting, shape, known)
+        return etendues if vignetting is None else etendues * _shares(vignetting, shape, known)
     except OpticsError as cause:
         raise ImageError(f"image: {cause}") from cause
 
@@ -125,4 +131,5 @@ def _shares(vignetting: Vignetting, shape: tuple[int, int], known: Metadata) -> 
     height, width = shape
     usual = (*zip(CROP, (width, height, 0, 0), strict=True), ("binning", 1), ("pixel_pitch", 0))
     wide, high, left, top, bins, pitch = (recorded_number(known, name, value) for name, value in usual)
-    return vignetting.on_pixels(pitch, (round(wide), round(high)), (left, top), (width, height), int(bins))
+    sides = whole("image: 'binning' of the metadata", bins, ImageError, "1")
+    return vignetting.on_pixels(pitch, (round(wide), round(high)), (left, top), (width, height), sides)

@@ -22,7 +22,7 @@ def recorded_number(
     if (value := metadata.get(name)) is None:
         return default
     try:
-        found = float(value)  # type: ignore[arg-type]  # a text may be a number
+        found = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]  # a text may be a number
     except (TypeError, ValueError, OverflowError):
         found = math.nan
     if not math.isfinite(found):

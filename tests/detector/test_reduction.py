@@ -392,15 +392,54 @@ def test_maps_and_frames_of_frames_have_the_rows_of_their_counts(tmp_path, caplo
     np.testing.assert_array_equal(reduced_by(True, True), reduced_by(False, False))
 
 
-@pytest.mark.parametrize("wrong", ["60.0 s", "", "inf"])
+@pytest.mark.parametrize("wrong", ["60.0 s", "", "inf", True, -1.5])
 def test_a_keyword_that_is_no_number_is_left_out(tmp_path, caplog, wrong):
-    """Of an exposure time and a binning. Seen to fail: the file was refused as damaged, with the fix to copy it."""
+    """Of an exposure time and a binning. Seen to fail: the file was refused as damaged, with the fix to copy it; a
+    logical T was 1 s, and a binning of -1.5 was -1.
+    """
     fits = pytest.importorskip("astropy.io.fits")
     header = fits.Header({"EXPTIME": wrong, "XBINNING": wrong, "XPIXSZ": 13.5})
     fits.PrimaryHDU(np.ones((3, 4), np.uint16), header).writeto(tmp_path / "a.fits")
     found = read_counts(tmp_path / "a.fits")
     assert (found.exposure_time, found.binning, found.pixel_pitch) == (None, None, 0.0135)
-    assert f"EXPTIME = {wrong!r} is no number" in caplog.text
+    assert f"EXPTIME = {wrong!r} is no number >= 0 of seconds; it is left out" in caplog.text
+    assert f"XBINNING = {wrong!r} is no whole number >= 1; it is left out" in caplog.text
+
+
+def test_sides_of_pixels_in_fits_files(tmp_path):
+    """One of two keywords is enough; sides that differ by more than rounding are refused.
+
+    Seen to fail: YBINNING = 2 alone was no binning, 13.5 × 27 µm were passed over, and so were 13.5 × 13.50001.
+    """
+    fits = pytest.importorskip("astropy.io.fits")
+
+    def read(**header):
+        fits.PrimaryHDU(np.ones((3, 4), np.uint16), fits.Header(header)).writeto(tmp_path / "a.fits", overwrite=True)
+        found = read_counts(tmp_path / "a.fits")
+        return found.binning, found.pixel_pitch
+
+    assert read(YBINNING=2, YPIXSZ=27.0) == (2, 0.027)
+    assert read(XBINNING=1.0, XPIXSZ=13.5, YPIXSZ=13.50001) == (1, 0.0135)
+    assert read(XPIXSZ=0.0) == (None, None)
+    with pytest.raises(ImageError, match=r"has pixels of 13.5 x 27 um"):
+        read(XPIXSZ=13.5, YPIXSZ=27.0)
+
+
+def test_counts_in_another_unit_or_with_a_sign_too_many(tmp_path, caplog):
+    """BUNIT = electron is told: the power was too large by the gain of 1.6 without a word. 40000 DN that were stored in
+    16 bits with a sign are -25536, which is refused; seen to fail: a pixel of negative power, not saturated.
+    """
+    fits = pytest.importorskip("astropy.io.fits")
+    for unit, told in (("adu", 0), ("electron", 1)):
+        header = fits.Header({"BUNIT": unit, "ROWORDER": "TOP-DOWN"})
+        fits.PrimaryHDU(np.ones((3, 4), np.uint16), header).writeto(tmp_path / f"{unit}.fits")
+        CCD.reduce(tmp_path / f"{unit}.fits", **SETTINGS)
+        assert caplog.text.count("states the unit 'electron' (BUNIT); its values are taken for DN") == told
+    counts = np.full((3, 4), 1000, np.uint16)
+    counts[1, 2] = 40000
+    np.save(tmp_path / "wrapped.npy", counts.view(np.int16))
+    with pytest.raises(ImageError, match="go down to -25536: those above 32767 have lost 65536"):
+        CCD.reduce(tmp_path / "wrapped.npy", **SETTINGS)
 
 
 def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):

@@ -10,12 +10,13 @@ import pytest
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.stray_light import Kernel
 from mitsuba_fspt.images.exposure import exposure_of
+from mitsuba_fspt.images.noise_model import NoiseModel
 from mitsuba_fspt.images.pixel_axes import PixelAxes
 from mitsuba_fspt.images.pixel_map import recorded
 from mitsuba_fspt.images.radiometry import etendue_of
 from mitsuba_fspt.images.vignetting_file import read_vignetting
 from mitsuba_fspt.inverse import calibrate
-from mitsuba_fspt.runtime.errors import FsptError
+from mitsuba_fspt.runtime.errors import FsptError, ImageError
 
 LENS = {"focal_length": 55.0, "f_number": 2.8, "focus_distance": 165.0, "pixel_pitch": 0.5, "transmittance": 0.9}
 EXPOSED = {"gain": 1.6, "bias": 500.0, "bits": 16}
@@ -28,13 +29,15 @@ def image(**metadata):
     return fspt.Image(ONES, metadata=metadata)
 
 
-@pytest.mark.parametrize("wrong", ["abc", [1.0], float("nan")])
+@pytest.mark.parametrize("wrong", ["abc", [1.0], float("nan"), True])
 @pytest.mark.parametrize(
     ("name", "read"),
     [
         ("gain", lambda m: recorded(EXPOSED | m, "gain", (4, 4))),
         ("bits", lambda m: exposure_of("e.npz", {"electrons": ONES}, EXPOSED | m)),
         ("transmittance", lambda m: etendue_of((4, 4), LENS | m)),
+        ("f_number", lambda m: etendue_of((4, 4), LENS | m)),
+        ("electrons_per_watt", lambda m: image(**m).electrons_per_watt),
         (
             "passes",
             lambda m: fspt.compare(fspt.Image(SLOPE, SLOPE, metadata={"method": "path"} | m), fspt.Image(SLOPE)),
@@ -42,7 +45,9 @@ def image(**metadata):
     ],
 )
 def test_a_number_that_is_none_is_refused_by_name(name, read, wrong):
-    """Seen to fail: bare ValueError and TypeError of float()."""
+    """Seen to fail: bare ValueError and TypeError of float(); True, a logical of other programs, was 1, so that an
+    f-number of it gave an étendue 7.8 times too large.
+    """
     with pytest.raises(FsptError, match=rf"'{name}' of the metadata must be a finite number, got"):
         read({name: wrong})
 
@@ -68,6 +73,37 @@ def test_a_pixel_pitch_that_no_film_has_is_refused(read, wrong):
     """Seen to fail: a pitch of -0.5 mirrored the axes of an image, 0 took them away, and both were exposed."""
     with pytest.raises(FsptError, match=r"'pixel_pitch' of the metadata must be"):
         read({"pixel_pitch": wrong})
+
+
+def test_the_sign_of_a_magnification_says_nothing_about_sizes():
+    """-0.5 of programs that give an inverted image a sign is 0.5; 0, of an object at infinity, is none.
+
+    Seen to fail: the image was refused, and could be neither shown nor written.
+    """
+    axes = [PixelAxes.of((4, 4), LENS | {"magnification": t}) for t in (-0.5, 0.5, 0)]
+    assert [one.side for one in axes] == [1.0, 1.0, 0.5]
+    np.testing.assert_array_equal(axes[0].x, [-1.5, -0.5, 0.5, 1.5])
+    assert [one.label for one in axes] == ["mm on the virtual detector plane"] * 2 + ["mm on the detector"]
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "read"),
+    [
+        ("gain_error", -0.5, lambda one: one + one),
+        ("gain_error", 1.0, lambda one: one.gain_error),
+        ("electrons_per_watt", 0.0, lambda one: one.electrons_per_watt),
+        ("read_noise", -3.5, lambda one: one.read_noise),
+        ("transmittance", -0.9, lambda one: one.roi("25%", 650)),
+        ("transmittance", 1.5, lambda one: one.roi("25%", 650)),
+        ("prnu", -0.1, NoiseModel.of),
+        ("excess_noise", float("inf"), NoiseModel.of),
+    ],
+)
+def test_a_number_that_no_camera_has_is_refused(name, wrong, read):
+    """Seen to fail: the radiance was 0 or too small by a third, and errors were infinite or without the gain's."""
+    known = LENS | {"electrons_per_watt": 1e15, "read_noise": 3.5, "detector": "A"} | {name: wrong}
+    with pytest.raises(ImageError, match="(?i)" + name.replace("_", ".")):
+        read(image(**known))
 
 
 @pytest.mark.parametrize("wrong", ["abc", -0.5])
