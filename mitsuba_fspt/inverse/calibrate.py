@@ -47,6 +47,7 @@ class Calibration:
     pixels : number of them
     condition : of the Jacobian with columns of length 1
     scene : name or text of the scene file
+    warnings : lines of stderr on χ², and on parameters that ended at a border of the values that the scene allows
     """
 
     free: tuple[str, ...]
@@ -57,6 +58,7 @@ class Calibration:
     pixels: int
     condition: float
     scene: str
+    warnings: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """Numbers about the result by name, ready for JSON."""
@@ -68,6 +70,7 @@ class Calibration:
             "chi2": self.chi2,
             "pixels": self.pixels,
             "condition": self.condition,
+            "warnings": list(self.warnings),
         }
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -163,7 +166,8 @@ def _images(given: Any, views: int) -> list[Image]:
 def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, scene: str) -> Calibration:
     """The fitted numbers by name."""
     pixels = int(measured.used.sum())
-    tell_misfit("calibrate", fitted.chi2_sum, pixels, len(names), [fitted.noise])
+    warnings = told("calibrate", fitted.borders)
+    warnings += tell_misfit("calibrate", fitted.chi2_sum, pixels, len(names), [fitted.noise])
     return Calibration(
         names,
         dict(zip(names, map(float, fitted.values), strict=True)),
@@ -173,6 +177,7 @@ def _calibration(names: tuple[str, ...], measured: Measured, fitted: Fitted, sce
         pixels,
         fitted.condition,
         scene,
+        tuple(warnings),
     )
 
 

@@ -11,13 +11,14 @@ sides where the fit starts and where it ends, and from the images of the search 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runtime.errors import ExitanceError, InversionError, OpticsError, SceneError
+from ..runtime.errors import LONGEST_TEXT, ExitanceError, InversionError, OpticsError, SceneError, one_line
 from .common_noise import beyond_independent
 from .damped_steps import DampedSteps, LinearFit
 from .measurement import Chi2, Noise
@@ -101,15 +102,36 @@ class Measured:
         return np.where(self.used, np.sqrt(variance), 1.0)
 
 
+@dataclass(frozen=True)
+class Border:
+    """Border of the values that a scene allows, at which a parameter ended.
+
+    beyond : a value next to it that is refused;  refusal : why
+    """
+
+    beyond: float
+    refusal: Exception
+
+    @property
+    def reason(self) -> str:
+        """Why values beyond are refused, without the values of all parameters that the message begins with."""
+        text = one_line(self.refusal, LONGEST_TEXT).rstrip(".")
+        return text.partition(": ")[2] if text.startswith("calibrate, at ") else text
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Values (p,), covariance (p, p), Σ (residual/σ)², what the noise makes of it, and condition number."""
+    """Values (p,), covariance (p, p), Σ (residual/σ)², what the noise makes of it, and condition number.
+
+    borders : one line for each parameter that ended at a `Border`, where there is no minimum
+    """
 
     values: Array
     covariance: Array
     chi2_sum: float
     noise: Chi2
     condition: float
+    borders: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +174,8 @@ class CalibrationFit:
         self._images = images
         self._steps = np.ones(len(start))
         self._kept = Slopes(np.full(len(start), np.inf), np.empty(0), np.empty(0), False)  # of no place
-        self._refusal: Exception | None = None  # of a step from the present values to some without an image
+        self._refused: tuple[Array, Exception] | None = None  # step from the present values to some without an image
+        self._borders: dict[int, Border] = {}  # of the parameters that are held there, by number
 
     def solved(self) -> Fitted:
         """Minimum of Σ (residual/σ)², with σ of its own image."""
@@ -171,7 +194,18 @@ class CalibrationFit:
             self.measured.noise.common(image, used), slopes @ inverse / sigma[used][:, None]
         )
         scale = np.outer(self._steps, self._steps)
-        return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition)
+        borders = self._border_lines(self._values(y), -inverse @ (slopes.T @ residual) / np.sqrt(np.diag(inverse)))
+        return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition, borders)
+
+    def _border_lines(self, values: Array, beyond: Array) -> tuple[str, ...]:
+        """A line for each parameter at its border; `beyond` (p,): distance of the minimum from the values [sd]."""
+        return tuple(
+            f"'{self.names[k]}' ended at {values[k]:.6g}, the border of the values that the scene allows; at "
+            f"{one.beyond:.6g}: {one.reason}. The minimum lies {abs(beyond[k]):.2g} sd beyond, so that value +- sd is "
+            "no interval. Check the scene's other numbers and the images, or fix it."
+            for k, one in self._borders.items()
+            if beyond[k] ** 2 > self.settings.chi2
+        )
 
     def _values(self, y: Array) -> Array:
         return self.start + self._steps * y
@@ -185,37 +219,78 @@ class CalibrationFit:
         """y (p,) of the minimum; slopes are then measured there or nearby.
 
         Of a fall of Σ (residual/σ)² below the fit's end the errors of the images would be the larger part. Steps to
-        values without an image are made shorter; where no other leads on, the error of these values is raised.
+        values without an image are made shorter. Where no other leads on, the parameters that are at their borders are
+        held, and the others fitted on.
         """
         y, damped = np.zeros(len(self.start)), DampedSteps(self.settings.chi2, longest=self.settings.reach)
         for _ in range(self.settings.steps):
             image, sigma = self._weighted(y)
-            residual, self._refusal = self._residual(image, sigma), None
-            linear = LinearFit.of(self._whitened(sigma), residual)
-            nearer = damped.lower(linear, partial(self._nearer, y, sigma, float(residual @ residual)))
-            if nearer is not None:
+            residual, self._refused = self._residual(image, sigma), None
+            whitened, free = self._whitened(sigma), [k for k in range(len(y)) if k not in self._borders]
+            nearer = None
+            if free:
+                linear = LinearFit.of(whitened[:, free], residual)
+                attempt = partial(self._nearer, y, sigma, float(residual @ residual), free, linear.lengths)
+                nearer = damped.lower(linear, attempt)
+            if nearer is y or (nearer is None and self._refused is not None and self._are_measured(y)):
+                self._hold(y)
+            elif nearer is not None:
                 y = nearer
                 self._follow(y)
-            elif self._are_measured(y):
-                if self._refusal is not None:
-                    raise self._refusal
-                return y
-            else:
+            elif not self._are_measured(y):
                 self._measure(y)
+            elif not self._release(y, whitened, residual):
+                return y
         shown = ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, self._values(y), strict=True))
         raise InversionError(
             f"calibrate: the fit has not ended after {self.settings.steps} steps, at {shown}. Start nearer, with other "
             "<default> values."
         )
 
-    def _nearer(self, y: Array, sigma: Array, before: float, step: Array) -> Array | None:
-        """y + step if there is an image and its Σ (residual/σ)² is less than `before`."""
+    def _nearer(
+        self, y: Array, sigma: Array, before: float, free: list[int], lengths: Array, step: Array
+    ) -> Array | None:
+        """y and a step of the `free` parameters, if there is an image and its Σ (residual/σ)² is less than `before`.
+
+        y itself where a border is nearer than the fit's end leaves a parameter from its minimum, in standard deviations
+        of each alone, 1/`lengths`: shorter steps would only creep on.
+        """
+        whole = np.zeros(len(y))
+        whole[free] = step
         try:
-            image = self._power(y + step)
+            image = self._power(y + whole)
         except REFUSALS as refusal:
-            self._refusal = refusal
-            return None
-        return y + step if np.sum(self._residual(image, sigma) ** 2) < before else None
+            self._refused = whole, refusal
+            return y if np.abs(step * lengths).max() ** 2 <= self.settings.chi2 else None
+        return y + whole if np.sum(self._residual(image, sigma) ** 2) < before else None
+
+    def _hold(self, y: Array) -> None:
+        """Hold the parameters at their borders: those of which the refused step alone is refused.
+
+        Where none is, the border is one of a combination, and all parameters of the step are held.
+        """
+        if self._refused is None:
+            return
+        (step, refusal), found = self._refused, dict[int, Border]()
+        beyond = self._values(y + step)
+        for k in np.flatnonzero(step):
+            try:
+                self._power(y + step * (np.arange(len(y)) == k))
+            except REFUSALS as own:
+                found[int(k)] = Border(float(beyond[k]), own)
+        self._borders |= found or {int(k): Border(float(beyond[k]), refusal) for k in np.flatnonzero(step)}
+
+    def _release(self, y: Array, whitened: Array, residual: Array) -> bool:
+        """Release parameters that are held at a border from which Σ (residual/σ)² now falls inwards; True if any is."""
+        inwards = list[int]()
+        for k, border in self._borders.items():
+            pull = float(whitened[:, k] @ residual / np.linalg.norm(whitened[:, k]))
+            outwards = np.sign((border.beyond - self._values(y)[k]) / self._steps[k])
+            if pull * outwards < 0 and pull**2 > self.settings.chi2:
+                inwards.append(k)
+        for k in inwards:
+            del self._borders[k]
+        return bool(inwards)
 
     def _residual(self, image: Array, sigma: Array) -> Array:
         """(pixels that count,) measured − fitted power, in standard deviations."""
@@ -274,8 +349,7 @@ class CalibrationFit:
         for k, (name, value) in enumerate(zip(self.names, self.start, strict=True)):
             step, change = 3e-3 * (abs(value) or 1.0), 0.0
             while step < 100 * max(abs(value), 10.0):
-                moved = self.start + step * (np.arange(len(self.start)) == k)
-                change = float(np.linalg.norm((self._images(moved)[0] - first)[used]) / light)
+                change = float(np.linalg.norm((self._moved(k, step) - first)[used]) / light)
                 if goal / 3 <= change <= 3 * goal:
                     break
                 step *= float(np.clip(goal / max(change, 1e-300), 0.02, 30))
@@ -283,6 +357,14 @@ class CalibrationFit:
                 raise InversionError(f"calibrate: no pixel depends on '{name}'. Leave it out of 'free'.")
             steps[k] = step
         return steps
+
+    def _moved(self, k: int, step: float) -> Array:
+        """Images [W] a step of parameter k from the start, to the other side where one has no image."""
+        way = step * (np.arange(len(self.start)) == k)
+        try:
+            return self._images(self.start + way)[0]
+        except REFUSALS:
+            return self._images(self.start - way)[0]
 
     def _require_determined(self, y: Array) -> tuple[Array, float]:
         """Slopes and condition number of the Jacobian; UndeterminedError with the combinations that stay free."""
@@ -301,8 +383,9 @@ class CalibrationFit:
             way = directions[-1] / lengths
             way /= np.abs(way).max()
             one = slopes @ way
-            two = (self._slope(y, way, 2.0) / sigma)[self.measured.used]
-            free[-1] = np.linalg.norm(two - one) > self.settings.doubtful * np.linalg.norm(one)
+            with suppress(*REFUSALS):  # of both sides, in a corner between borders
+                two = (self._slope(y, way, 2.0) / sigma)[self.measured.used]
+                free[-1] = np.linalg.norm(two - one) > self.settings.doubtful * np.linalg.norm(one)
         if free.any():
             raise UndeterminedError(self.names, condition, directions[free])
         return slopes, condition

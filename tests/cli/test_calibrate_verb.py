@@ -53,6 +53,30 @@ def test_values_and_the_fitted_scene(run, folder):
     fitted.unlink()
 
 
+def test_a_border_is_told(run, folder, caplog):
+    """Images 5 % too bright ask for a transmittance of 1.05; it stays at 1, in one line and in the JSON.
+
+    Seen to fail: exit code 2 with the rule of the transmittance, of the first difference from 1.
+    """
+    text = (folder / "ball.xml").read_bytes().decode()
+    plain = '<transform name="to_world">'
+    free = text.replace(plain, '<float name="transmittance" value="$tau"/>' + plain, 1)
+    (folder / "tau.xml").write_text(free.replace("<sensor", '<default name="tau" value="1"/><sensor', 1))
+    image = fspt.read(folder / "image.exr")
+    bright = fspt.Image(1.05 * image.power, image.error, metadata=image.metadata)
+    bright.write(folder / "bright.exr")
+    code, out, _ = run(
+        "calibrate", folder / "tau.xml", folder / "bright.exr", "--free", "tau,distance", *COARSE, "--json"
+    )
+    record = json.loads(out)
+    assert (code, record["warnings"]) == (0, [line.removeprefix("fspt: calibrate: ") for line in caplog.messages])
+    assert record["warnings"][0].startswith(
+        "'tau' ended at 1, the border of the values that the scene allows; at 1.00006: fspt_lens: 'transmittance' must "
+        "be > 0 and at most 1, got 1.00006. Give for example 0.9. The minimum lies 10 sd beyond"
+    )
+    assert record["values"]["tau"] == pytest.approx(1, abs=0.1 * record["sd"]["tau"])
+
+
 def test_undetermined_parameters_are_reported(run, folder):
     """Gain and f-number scale the image alike: exit code 2, the combination on stderr and as JSON, no file."""
     arguments = ("calibrate", folder / "ball.xml", folder / "image.exr", "--free", "f_number,gain", "--json")
