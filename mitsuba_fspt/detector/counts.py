@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FIRST, FITS, LAST, TIFF, read_frame, tell_open_rows
+from ..images.frame_file import FIRST, FITS, LAST, SAME_PITCH, TIFF, read_frame, tell_open_rows
 from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
@@ -94,18 +94,34 @@ def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Coun
     return found
 
 
-def tell_time(counts: Counts, given: float) -> None:
-    """Say in one line on stderr that the file of the counts states another exposure time than the given one."""
-    stated = counts.exposure_time
-    if stated is not None and abs(stated - given) > SAME_TIME * given:
+def tell_stated(counts: Counts, time: float, binning: int, pitch: float | None, own: float | None) -> None:
+    """Say in one line each on stderr what the file of the counts states otherwise than the numbers that are used.
+
+    time : exposure time [s];  pitch, own : of the pixels read out and of the detector's own pixels [mm], or None
+    """
+    binned = None if own is None else own * binning
+    side = binned if pitch is None else pitch
+    for name, used, stated, unit, same in (
+        ("exposure_time", time, counts.exposure_time, " s", SAME_TIME),
+        ("binning", binning, counts.binning, "", 0.0),
+        ("pixel_pitch", side, counts.pixel_pitch, " mm", SAME_PITCH),
+    ):
+        if used is not None and stated is not None and abs(stated - used) > same * used:
+            LOG.warning(
+                "fspt: reduce: '%s' is %g%s, the file of the counts states %g%s. The former is used.",
+                *(name, used, unit, stated, unit),
+            )
+    if side is not None and binned is not None and abs(side - binned) > SAME_PITCH * binned:
         LOG.warning(
-            "fspt: reduce: 'exposure_time' is %g s, the file of the counts states %g s. The given one is used.",
-            given,
-            stated,
+            "fspt: reduce: 'pixel_pitch' is %g mm, that of the detector times the binning of %d is %g mm. The dark "
+            "current is that of the former, %.3g of the detector's pixels.",
+            *(side, binning, binned, (side / binned * binning) ** 2),
         )
+    _tell_unit(counts)
+    tell_open_rows("reduce: the FITS file of the counts", counts.top_row, "in all frames of this camera")
 
 
-def tell_unit(counts: Counts) -> None:
+def _tell_unit(counts: Counts) -> None:
     """Say in one line on stderr that the values are taken for DN where the file states another unit."""
     if counts.unit is not None and counts.unit.lower() not in DN:
         LOG.warning(
@@ -113,11 +129,6 @@ def tell_unit(counts: Counts) -> None:
             "counts, or correct BUNIT.",
             counts.unit,
         )
-
-
-def tell_rows(counts: Counts) -> None:
-    """Say in one line on stderr that the file of the counts does not state which of its rows is the top one."""
-    tell_open_rows("reduce: the FITS file of the counts", counts.top_row, "in all frames of this camera")
 
 
 def require_same_rows(name: str, top_row: str | None, other: str, others: str | None) -> None:

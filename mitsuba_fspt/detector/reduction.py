@@ -42,10 +42,8 @@ from .counts import (
     frame_of,
     require_same_rows,
     require_same_time,
-    tell_rows,
-    tell_time,
+    tell_stated,
     tell_unequal_frames,
-    tell_unit,
 )
 from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
@@ -225,9 +223,7 @@ def reduce_counts(
         exposed = replace(exposed, binning=raw.binning or 1)
     if exposed.pixel_pitch is None and detector.pixel_pitch is None:
         exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
-    tell_time(raw, exposed.exposure_time)
-    tell_unit(raw)
-    tell_rows(raw)
+    tell_stated(raw, exposed.exposure_time, exposed.binning or 1, exposed.pixel_pitch, detector.pixel_pitch)
     require_rows_of_maps(detector, "counts", raw)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")

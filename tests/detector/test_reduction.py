@@ -311,7 +311,33 @@ def test_another_exposure_time_in_the_file_is_reported(tmp_path, caplog):
     found = CCD.reduce(tmp_path / "a.fits", exposure_time=30, wavelength_nm=650)
     assert found.electrons_per_watt == pytest.approx(PER_WATT / 2)
     (told,) = [record.getMessage() for record in caplog.records]
-    assert "'exposure_time' is 30 s, the file of the counts states 60 s" in told
+    assert "'exposure_time' is 30 s, the file of the counts states 60 s. The former is used" in told
+
+
+def test_another_binning_or_pitch_than_that_of_the_file_is_told(tmp_path, caplog):
+    """The dark current of 5 e-/px/s counts once, four times or as often as the pitch says, each with a line.
+
+    Seen to fail: 4500 electrons too much by binning=1 in place of the file's 2, without a word.
+    """
+    fits = pytest.importorskip("astropy.io.fits")
+    header = fits.Header({"EXPTIME": 300.0, "XBINNING": 2, "XPIXSZ": 27.0, "ROWORDER": "TOP-DOWN"})
+    counts = np.full((3, 4), 500 + (5 * 300 * 4 + 16000) / 1.6)
+    fits.PrimaryHDU(counts.astype(np.uint16), header).writeto(tmp_path / "a.fits")
+    camera = replace(CCD, dark_current=5.0)
+    for given, electrons, told in (
+        ({}, 16000, []),
+        ({"binning": 1}, 20500, ["'binning' is 1, the file of the counts states 2", "'pixel_pitch' is 0.0135 mm"]),
+        (
+            {"pixel_pitch": 0.0135},
+            20500,
+            ["the file of the counts states 0.027 mm", "that of the detector times the binning of 2 is 0.027 mm. The"],
+        ),
+    ):
+        caplog.clear()
+        found = camera.reduce(tmp_path / "a.fits", exposure_time=300, wavelength_nm=650, **given)
+        np.testing.assert_allclose(found.power * found.electrons_per_watt, electrons, rtol=1e-6)
+        assert len(caplog.messages) == len(told)
+        assert all(part in line for part, line in zip(told, caplog.messages, strict=True))
 
 
 def test_rows_of_fits_files(tmp_path, caplog):
