@@ -94,13 +94,13 @@ def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Coun
     return found
 
 
-def tell_stated(counts: Counts, time: float, binning: int, pitch: float | None, own: float | None) -> None:
+def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float | None, own: float | None) -> None:
     """Say in one line each on stderr what the file of the counts states otherwise than the numbers that are used.
 
-    time : exposure time [s];  pitch, own : of the pixels read out and of the detector's own pixels [mm], or None
+    time : exposure time [s];  binning : None for 1, which nothing states
+    pitch, own : of the pixels read out and of the detector's own pixels [mm], or None
     """
-    binned = None if own is None else own * binning
-    side = binned if pitch is None else pitch
+    side = own * (binning or 1) if pitch is None and own is not None else pitch
     for name, used, stated, unit, same in (
         ("exposure_time", time, counts.exposure_time, " s", SAME_TIME),
         ("binning", binning, counts.binning, "", 0.0),
@@ -111,11 +111,11 @@ def tell_stated(counts: Counts, time: float, binning: int, pitch: float | None, 
                 "fspt: reduce: '%s' is %g%s, the file of the counts states %g%s. The former is used.",
                 *(name, used, unit, stated, unit),
             )
-    if side is not None and binned is not None and abs(side - binned) > SAME_PITCH * binned:
+    if pitch and own and binning and abs(pitch - own * binning) > SAME_PITCH * own * binning:
         LOG.warning(
             "fspt: reduce: 'pixel_pitch' is %g mm, that of the detector times the binning of %d is %g mm. The dark "
             "current is that of the former, %.3g of the detector's pixels.",
-            *(side, binning, binned, (side / binned * binning) ** 2),
+            *(pitch, binning, own * binning, (pitch / own) ** 2),
         )
     _tell_unit(counts)
     tell_open_rows("reduce: the FITS file of the counts", counts.top_row, "in all frames of this camera")

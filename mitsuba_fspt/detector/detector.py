@@ -173,9 +173,9 @@ class Detector(DetectorParameters):
         exposure_time : [s] of one frame, > 0
         wavelength_nm, spectrum : of the light at the detector, see `expose`; neither: that in `metadata`, or that
             which the lens of `scene` passes
-        binning : side of the square of pixels that was read out as one; None: that of the file, else 1
+        binning : side of the square of pixels that was read out as one; None: that of the file, of `metadata`, or 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
-            None: that of the file, if the detector has none of its own
+            None: that of `metadata`, or of the file, if the detector has none of its own
         frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
         bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias, and may be a
             number
@@ -185,7 +185,7 @@ class Detector(DetectorParameters):
         scene : for 'lens': what `render` takes, with the camera's lens, film and crop window
         bad_pixels : (h, w) or its file, not 0 for pixels to mask
         cosmic_rays : also mask pixels that cosmic rays have hit
-        metadata : further entries, such as those of the rendered image that was exposed, without how it was computed
+        metadata : further entries, such as those of the rendered image; pitch and place become those of the counts
 
         The image contains its noise as a function of the light (Eq. M.24). The metadata hold, for electrons before the
         register, `electrons_per_watt`, `read_noise` [e-], `dark_electrons` (variance of dark current, spurious charge,

@@ -48,6 +48,7 @@ from .counts import (
 from .dark_charge import Background, shown_charge
 from .flat_field import FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
+from .read_out import pixels_read_out
 from .saturation import full_pixels, saturated
 
 if TYPE_CHECKING:
@@ -219,11 +220,12 @@ def reduce_counts(
 ) -> Image:
     """Image in W of raw counts; see `Detector.reduce`."""
     raw = frame_of(counts, "counts", frames)
-    if exposed.binning is None:
-        exposed = replace(exposed, binning=raw.binning or 1)
-    if exposed.pixel_pitch is None and detector.pixel_pitch is None:
-        exposed = replace(exposed, pixel_pitch=raw.pixel_pitch)
-    tell_stated(raw, exposed.exposure_time, exposed.binning or 1, exposed.pixel_pitch, detector.pixel_pitch)
+    binning = raw.binning if exposed.binning is None else exposed.binning
+    binning, pitch, metadata = pixels_read_out(metadata or {}, binning, exposed.pixel_pitch, detector.pixel_pitch)
+    if pitch is None and detector.pixel_pitch is None:
+        pitch = raw.pixel_pitch
+    tell_stated(raw, exposed.exposure_time, binning, pitch, detector.pixel_pitch)
+    exposed = replace(exposed, binning=binning or 1, pixel_pitch=pitch)
     require_rows_of_maps(detector, "counts", raw)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
@@ -234,7 +236,7 @@ def reduce_counts(
     electrons = _corrected(raw.values, dark.level, flat) * gain
     independent = detector.excess * dark.charge + gain**2 / 12  # gain²/12: variance of the rounding
     read = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2
-    shared = dark.shared(independent + read, raw.frames, metadata or {})
+    shared = dark.shared(independent + read, raw.frames, metadata)
     independent = independent + raw.frames * dark.added
     mask = full | rays | corrections.bad(raw)
     image = _image(detector, electrons, flat, independent, raw.frames, mask, exposed, metadata)
