@@ -398,8 +398,8 @@ MUTANTS = (
     Mutant(
         "light behind the filters",
         "optics/transmittance.py",
-        "light.through(curve) if curve else light",
-        "light",
+        "light.through(curve), light.mean_wavelength_nm",
+        "light, light.mean_wavelength_nm",
         ("tests/plugins/test_lens_transmittance.py",),
     ),
     Mutant(

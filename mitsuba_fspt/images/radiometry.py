@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..optics.light import Light
+from ..optics.light import SURFACE, Light
 from ..optics.pixel_etendue import pixel_etendues
 from ..optics.thin_lens import Lens, number_names
 from ..optics.vignetting import Vignetting
@@ -18,7 +18,7 @@ from ..runtime.numbers import whole
 from .formats import Metadata, write_planes
 from .image_data import ImageData
 from .pixel_axes import CROP, PixelAxes
-from .recorded_number import recorded_number
+from .recorded_number import recorded_number, recorded_positive
 from .vignetting_file import recorded_vignetting
 
 UNITS = {"W": "power", "photons/s": "photon_rate", "p/s/cm2/sr": "radiance"}  # with the quantity of each
@@ -65,8 +65,8 @@ def require_unit(unit: str, light: Light | None) -> None:
 def in_unit(image: ImageData, unit: str, light: Light | None = None) -> Converted:
     """Image in a unit of `UNITS`: W, photons/s or p/s/cm2/sr.
 
-    The radiance is that of a surface in focus: P/(τ G ⟨cos⁴θ⟩), with the étendue of each pixel (Eq. M.6); 0 on pixels
-    that no light can reach.
+    The radiance is that of a surface in focus: P/(τ G ⟨cos⁴θ⟩), with the étendue of each pixel (Eq. M.6), in photons
+    as the surface emits them, before a filter; 0 on pixels that no light can reach.
 
     Raises
     ------
@@ -81,10 +81,18 @@ def in_unit(image: ImageData, unit: str, light: Light | None = None) -> Converte
     if unit != "photons/s":
         etendues = etendue(image)
         inverse = np.divide(SQUARE_MM_PER_CM, etendues, out=np.zeros_like(etendues), where=etendues > 0)
-        factor, unit = factor * inverse, RADIANCE
+        factor, unit = factor * inverse * surface_ratio(image.metadata, light), RADIANCE
     quantity = "radiance" if unit == RADIANCE else UNITS[unit]
     error = None if image.error is None else (image.error * factor).astype(np.float64)
     return Converted((image.power * factor).astype(np.float64), error, quantity, unit, light)
+
+
+def surface_ratio(metadata: Metadata, light: Light) -> float:
+    """Photons per joule of the light that the surface emits over those of the `light` at the detector.
+
+    It is 1 but for a spectrum behind filters of a curve τ(λ), where P/τ is the power of the whole spectrum.
+    """
+    return (recorded_positive(metadata, SURFACE) or light.mean_wavelength_nm) / light.mean_wavelength_nm
 
 
 def etendue(image: ImageData) -> Plane:

@@ -29,6 +29,7 @@ METRE = 1e-9  # of one nm
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)  # exact to the fifth power: s · τ · η · λ has the fourth
 PRODUCT = 1e-6  # relative error of the integral of a product of curves by a curve of its own
 KEYS = ("wavelength_nm", "spectrum")  # of metadata
+SURFACE = "surface_wavelength_nm"  # of metadata: mean wavelength of a spectrum before the filters [nm]
 Spectrum = str | os.PathLike[str] | Curve
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..runtime.errors import OpticsError
 from ..runtime.wavelength import wavelength as checked
 from . import curve_file
-from .light import Light
+from .light import SURFACE, Light
 
 NUMBERS = ("transmittance", "wavelength_nm")  # of `fspt_lens`
 CURVE, SPECTRUM = "transmittance_curve", "spectrum"  # names of its files
@@ -76,11 +76,13 @@ class Filters:
     transmittance : share τ of the power, in (0, 1]
     curve : name of the file of the transmittance over the wavelength; None where τ is given as a number
     light : behind the filters, for which τ holds; None without a curve or a spectrum
+    surface_nm : mean wavelength [nm] of a spectrum before the filters, which the surface emits; None without both
     """
 
     transmittance: float = 1.0
     curve: str | None = None
     light: Light | None = None
+    surface_nm: float | None = None
 
     @classmethod
     def of(cls, numbers: Mapping[str, float], curve: Curve | None, spectrum: curve_file.Curve | None = None) -> Filters:
@@ -89,7 +91,9 @@ class Filters:
         file = curve.file if curve else None
         if spectrum is not None:
             light = Light(None, spectrum)
-            return cls(passed, file, light.through(curve) if curve else light)
+            if curve is None:
+                return cls(passed, file, light)
+            return cls(passed, file, light.through(curve), light.mean_wavelength_nm)
         return cls(passed, file, Light(numbers["wavelength_nm"], None) if curve else None)
 
     @property
@@ -104,6 +108,7 @@ class Filters:
             "t_stop": t_stop(f_number, self.transmittance),
         }
         found |= {} if self.curve is None else {CURVE: self.curve}
+        found |= {} if self.surface_nm is None else {SURFACE: self.surface_nm}
         return found | (self.light.metadata() if self.light else {})
 
 

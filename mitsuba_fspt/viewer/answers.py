@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..images.image import Image
 from ..images.pixel_axes import virtual_pitch
-from ..images.radiometry import etendue
+from ..images.radiometry import etendue, surface_ratio
 from ..optics.light import PLANCK_TIMES_LIGHT, Light
 from ..optics.models import model_names
 from ..rendering.live_scene import LiveScene
@@ -168,6 +168,7 @@ class Answers:
             "method": known.get("method"),
             "side": virtual_pitch(known),
             "wavelength_nm": light.mean_wavelength_nm if light else None,
+            "surface_ratio": surface_ratio(known, light) if light else 1.0,
             "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,
             "warnings": known.get("warnings", ""),
             "model": request.model or "",

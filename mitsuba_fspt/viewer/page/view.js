@@ -151,7 +151,7 @@ class Picture {
     const photons = wavelength * this.photons_per_joule_nm;
     if (unit === "photons") return photons;
     const etendue = this.plane.etendue;
-    return etendue ? (etendue[i] > 0 ? (100 * photons) / etendue[i] : 0) : NaN;
+    return etendue ? (etendue[i] > 0 ? (100 * photons * this.surface_ratio) / etendue[i] : 0) : NaN;
   }
 
   /** Values of a quantity, shape (h, w) row by row, in a unit. */
