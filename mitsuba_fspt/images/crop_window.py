@@ -9,6 +9,7 @@ from ..runtime.errors import ImageError
 from .formats import BESIDE
 from .image_data import ImageData
 from .noise_model import flat_digest, part_recorded
+from .recorded_number import recorded_number
 
 Part = TypeVar("Part", bound=ImageData)
 
@@ -24,8 +25,9 @@ def cropped(image: Part, key: Any) -> Part:
     known = dict(image.metadata)
     known.setdefault("film_width", width)
     known.setdefault("film_height", height)
-    known["crop_offset_x"] = known.get("crop_offset_x", 0) + left  # type: ignore[operator]  # a number of pixels
-    known["crop_offset_y"] = known.get("crop_offset_y", 0) + top  # type: ignore[operator]
+    for name, first in (("crop_offset_x", left), ("crop_offset_y", top)):
+        own = recorded_number(known, name, 0)
+        known[name] = first + (int(own) if own == int(own) else own)
     planes = {name: getattr(image, name) for name in ("power", *BESIDE)}
     parts = {name: plane[top:bottom, left:right] for name, plane in planes.items() if plane is not None}
     if "masked_pixels" in known and "mask" in parts:

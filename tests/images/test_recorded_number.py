@@ -38,6 +38,7 @@ def image(**metadata):
         ("transmittance", lambda m: etendue_of((4, 4), LENS | m)),
         ("f_number", lambda m: etendue_of((4, 4), LENS | m)),
         ("electrons_per_watt", lambda m: image(**m).electrons_per_watt),
+        ("crop_offset_x", lambda m: image(**m)[1:3]),
         (
             "passes",
             lambda m: fspt.compare(fspt.Image(SLOPE, SLOPE, metadata={"method": "path"} | m), fspt.Image(SLOPE)),
