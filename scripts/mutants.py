@@ -755,8 +755,8 @@ MUTANTS = (
     Mutant(
         "light of faces beside rough pixels",
         "integral/pupil/pupil_form.py",
-        "return (self.draft.coverage == 0)",
-        "return (self.draft.coverage < 0)",
+        "where & (draft.coverage == 0)",
+        "where & (draft.coverage < 0)",
         ("tests/integral/test_honest_error.py",),
     ),
     Mutant(

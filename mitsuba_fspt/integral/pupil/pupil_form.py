@@ -32,7 +32,7 @@ from . import node_rules
 from .draft import Draft, open_share
 from .lattices import refine_by_lattices
 from .node_sums import apply_rule
-from .nodes import BOTH, first_nodes, twelve_nodes
+from .nodes import BOTH, LIGHT_KNOWN, first_nodes, twelve_nodes
 from .transects import integrate_by_transects
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ FIRST_LINES, BESIDE_NARROW = 70, 600
 # Rounding of sums of faces' light along a row of pixels, over the brightest pixel. A value of lines of sight from which
 # they differ by less is kept: beside a far brighter surface it is more exact.
 ROUNDING = 1e-12
-
-DARK = 0.1  # of the tolerance: less light of faces may stay out where lines of sight meet none
 
 FEW = 1 << 18  # pixels of the coarse lattice for a lower bound of the brightest pixel
 MARGIN = 0.9  # share of their brightest value that counts, for the error of twelve nodes
@@ -138,8 +136,8 @@ class ByFaces(Protocol):
 class _Faces:
     """Gives rough pixels of a draft their value `by_faces`, once; they count as given from then on.
 
-    So do pixels on and around them on which no line of sight has met light, but faces send some: a corner may lie
-    between all lines.
+    So do pixels on and around them on which no line of sight has met a glowing surface, but faces send light: a corner
+    of the surface may lie between all lines.
 
     narrow : pixels (h, w) that get it in any case; set to False if the deadline leaves no time for them
     found : the pixels, their values, errors and coverage
@@ -173,44 +171,49 @@ class _Faces:
         if not (wanted | forced).any():
             return rough
         self.taken = True
-        around = draft.grown_by_reach(grid.flat(wanted | forced)) & (draft.coverage == 0)
+        around = draft.grown_by_reach(grid.flat(wanted & ~forced)) & (draft.coverage == 0)
         wanted |= grid.array(around) & allowed
         found = self.by_faces.run(wanted | forced, peak, Progress(deadline=draft.progress.deadline))
         self._count(found)
-        given, done = self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
-        return (rough | given) & ~done
+        left, done = self._give(found, grid.flat(wanted | forced), grid.flat(forced), peak)
+        return (rough | left) & ~done
 
     def _give(self, found: Solution, wanted: Mask, forced: Mask, peak: float) -> tuple[Mask, Mask]:
-        """Set the values, errors and coverage that are better; returns their pixels and those that are done."""
+        """Set the values, errors and coverage that are better; returns pixels with errors above the tolerance before,
+        and those that are not refined further."""
         draft = self.draft
         power, error, coverage = self._images(found)
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
         tolerance = dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest
-        taken = wanted & ((error < draft.error) | forced | self._unmet(power, tolerance))
+        self._count_unmet(wanted, power)
+        left = wanted & (draft.error > tolerance)
+        taken = wanted & ((error < draft.error) | forced)
         done = taken & ((error <= tolerance) | forced)
         same = dr.abs(power - draft.value) <= dr.opaque(mi.Float64, ROUNDING) * brightest
         power = dr.select(same, draft.value, power)
-        self.found = taken, power, error, coverage
+        self.found = wanted, power, error, coverage
         self._set(taken)
         draft.given, draft.given_error = (
             dr.select(done, new, old) for new, old in ((power, draft.given), (error, draft.given_error))
         )
         draft.computed &= ~done
         dr.eval(draft.value, draft.error, draft.given, draft.given_error, draft.computed)
-        return taken, done
+        return left, done
 
-    def _unmet(self, power: PixelArray, tolerance: PixelArray) -> Mask:
-        """Pixels on which no line of sight has met the light that faces send: the error of these is none."""
-        return (self.draft.coverage == 0) & (power > dr.opaque(mi.Float64, DARK) * tolerance)
+    def _count_unmet(self, where: Mask, power: PixelArray) -> None:
+        """Count light that faces send as an error of the pixels on which no line of sight meets a glowing surface."""
+        draft, most = self.draft, dr.opaque(mi.Float64, LIGHT_KNOWN) * power
+        draft.error = dr.select(where & (draft.coverage == 0), dr.maximum(draft.error, most), draft.error)
 
     def further(self) -> None:
         """Before lattices: the values of faces again where those of transects have larger errors, refined further."""
         draft, grid = self.draft, self.draft.grid
         if self.found is None:
             return
-        taken, power, error, _ = self.found
-        self._set(taken & draft.computed & ((error < draft.error) | self._unmet(power, draft.tolerance)))
-        left = grid.array(taken & draft.shown & (draft.error > draft.tolerance))
+        known, power, error, _ = self.found
+        self._count_unmet(known & draft.computed, power)
+        self._set(known & draft.computed & (error < draft.error))
+        left = grid.array(known & draft.shown & (draft.error > draft.tolerance))
         if not left.any() or draft.progress.deadline.passed():
             return
         peak = max(float(draft.at_least_peak(draft.peak)[0]), 0.0)
