@@ -175,7 +175,7 @@ class Detector(DetectorParameters):
             which the lens of `scene` passes
         binning : side of the square of pixels that was read out as one; None: that of the file, of `metadata`, or 1
         pixel_pitch : of the pixels read out [mm]; with it, `invert` can check that the image fits the scene;
-            None: that of `metadata`, or of the file, if the detector has none of its own
+            None: that of the file, if the detector has none of its own, else that of `metadata`
         frames : number of frames that counts (h, w) are the mean of; None: 1; of a stack, its length
         bias, dark : frames or stacks [DN] in place of `bias` and `dark_current`; `dark` contains the bias, and may be a
             number

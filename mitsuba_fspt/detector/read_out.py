@@ -23,7 +23,8 @@ def pixels_read_out(
     What is not given is that of the metadata. Their pixels may be smaller, as those of a rendered image whose exposure
     was binned: its pitch and crop window become those of the pixels read out.
 
-    binning, pitch : as given, or None;  own : pitch of the detector's own pixels [mm], or None
+    binning, pitch : as given or stated by the file of the counts, or None;  own : pitch of the detector's own pixels
+        [mm], or None
 
     Raises DetectorError where neither pitch says whether the metadata's pixels are binned.
     """
@@ -36,7 +37,8 @@ def pixels_read_out(
     if known is None:
         return binning, pitch, dict(metadata)
     side = pitch or _side(known, before, before if binning is None else binning, own)
-    larger = 1.0 if abs(side - known) <= SAME_PITCH * known else side / known
+    # Binnings are whole numbers; a pitch may differ by its measurement as well, which moves no pixel.
+    larger = max(round(side / known), 1) / max(round(known / side), 1)
     window = {key: recorded_number(metadata, key, 0.0, THING, DetectorError) for key in CROP if key in metadata}
     places = {} if larger == 1 else {key: value / larger for key, value in window.items()}
     return binning, side, {**metadata, **places}

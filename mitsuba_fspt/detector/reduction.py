@@ -221,9 +221,10 @@ def reduce_counts(
     """Image in W of raw counts; see `Detector.reduce`."""
     raw = frame_of(counts, "counts", frames)
     binning = raw.binning if exposed.binning is None else exposed.binning
-    binning, pitch, metadata = pixels_read_out(metadata or {}, binning, exposed.pixel_pitch, detector.pixel_pitch)
+    pitch = exposed.pixel_pitch
     if pitch is None and detector.pixel_pitch is None:
         pitch = raw.pixel_pitch
+    binning, pitch, metadata = pixels_read_out(metadata or {}, binning, pitch, detector.pixel_pitch)
     tell_stated(raw, exposed.exposure_time, binning, pitch, detector.pixel_pitch)
     exposed = replace(exposed, binning=binning or 1, pixel_pitch=pitch)
     require_rows_of_maps(detector, "counts", raw)

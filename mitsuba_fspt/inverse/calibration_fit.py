@@ -194,7 +194,8 @@ class CalibrationFit:
             self.measured.noise.common(image, used), slopes @ inverse / sigma[used][:, None]
         )
         scale = np.outer(self._steps, self._steps)
-        borders = self._border_lines(self._values(y), -inverse @ (slopes.T @ residual) / np.sqrt(np.diag(inverse)))
+        beyond = inverse @ (slopes.T @ residual) / np.sqrt(np.diag(covariance))
+        borders = self._border_lines(self._values(y), beyond)
         return Fitted(self._values(y), covariance * scale, float(residual @ residual), noise, condition, borders)
 
     def _border_lines(self, values: Array, beyond: Array) -> tuple[str, ...]:
@@ -267,18 +268,28 @@ class CalibrationFit:
     def _hold(self, y: Array) -> None:
         """Hold the parameters at their borders: those of which the refused step alone is refused.
 
-        Where none is, the border is one of a combination, and all parameters of the step are held.
+        Where none is, the border is one of a combination, and those are held without which the step is not refused; or
+        all, if there are none.
         """
         if self._refused is None:
             return
         (step, refusal), found = self._refused, dict[int, Border]()
-        beyond = self._values(y + step)
-        for k in np.flatnonzero(step):
-            try:
-                self._power(y + step * (np.arange(len(y)) == k))
-            except REFUSALS as own:
-                found[int(k)] = Border(float(beyond[k]), own)
-        self._borders |= found or {int(k): Border(float(beyond[k]), refusal) for k in np.flatnonzero(step)}
+        beyond, moved = self._values(y + step), [int(k) for k in np.flatnonzero(step)]
+        for k in moved:
+            if own := self._refusal(y + step * (np.arange(len(y)) == k)):
+                found[k] = Border(float(beyond[k]), own)
+        together = {k: Border(float(beyond[k]), refusal) for k in moved}
+        if not found:
+            found = {k: at for k, at in together.items() if not self._refusal(y + step * (np.arange(len(y)) != k))}
+        self._borders |= found or together
+
+    def _refusal(self, y: Array) -> Exception | None:
+        """Why there is no image at y, None if there is one."""
+        try:
+            self._power(y)
+        except REFUSALS as refusal:
+            return refusal
+        return None
 
     def _release(self, y: Array, whitened: Array, residual: Array) -> bool:
         """Release parameters that are held at a border from which Σ (residual/σ)² now falls inwards; True if any is."""

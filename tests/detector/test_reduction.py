@@ -12,7 +12,7 @@ import pytest
 from small_scenes import camera_scene, disk
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.detector.counts import read_counts
+from mitsuba_fspt.detector.counts import Counts, read_counts
 from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.detector.reduction import Corrections, Exposed, calibrated, read_measured, reduce_counts, reduced
 from mitsuba_fspt.images.comparison import compare
@@ -319,7 +319,8 @@ def test_metadata_of_pixels_before_binning():
 
     The metadata are those of the exposure, whose dark current of four own pixels counts, or of the part of the rendered
     image that was exposed. Seen to fail: 360 electrons too much on each pixel by the former, four times the radiance at
-    other places by the latter. Without a pitch of the detector's own nothing says which pixels the metadata mean.
+    other places by the latter. Without a pitch of the detector's own or the file nothing says which pixels the metadata
+    mean. Seen to fail: that refusal although the file states the pitch, and a crop window 2.5 % smaller.
     """
     lens = {"focal_length": 55.0, "f_number": 2.8, "focus_distance": 165.0, "magnification": 0.5, "pixel_pitch": 0.2}
     camera = replace(CCD, pixel_pitch=0.2, dark_current=2.0, full_well=1e9, prnu=0.0)
@@ -332,8 +333,14 @@ def test_metadata_of_pixels_before_binning():
         assert found.metadata["binning"] == 2
         np.testing.assert_allclose(found.x, (part.x[::2] + part.x[1::2]) / 2, atol=1e-9)
         assert found.roi(None, 650).mean_radiance == pytest.approx(expected.mean_radiance, rel=5e-3)
+    other, own = replace(camera, pixel_pitch=None), {"binning": 2, "metadata": part.metadata}
     with pytest.raises(DetectorError, match=r"'binning' is 2, the 'pixel_pitch' = 0.2 mm of the metadata is that of"):
-        replace(camera, pixel_pitch=None).reduce(exposure.counts, **given, binning=2, metadata=part.metadata)
+        other.reduce(exposure.counts, **given, **own)
+    # The pitch of the file, and one that was measured anew, which moves no pixel.
+    for pitch, options in ((0.4, {}), (0.41, {"pixel_pitch": 0.41})):
+        stated = Counts(exposure.counts, binning=2, pixel_pitch=0.4)
+        found = other.reduce(stated, **given, metadata=part.metadata, **options)
+        np.testing.assert_allclose(found.x * 0.4 / pitch, (part.x[::2] + part.x[1::2]) / 2, atol=1e-9)
 
 
 def test_another_binning_or_pitch_than_that_of_the_file_is_told(tmp_path, caplog):

@@ -195,7 +195,7 @@ def test_steps_to_values_that_a_scene_refuses_are_made_shorter():
 
 
 def bounded(model, true, allowed, start=(1.0, 1.0), variance=0.086):
-    """Fit of two parameters of images by a `model`, of which those not `allowed` are refused."""
+    """Fit of the parameters a, b … of images by a `model`, of which those not `allowed` are refused."""
 
     def pictures(values):
         if not allowed(*values):
@@ -206,7 +206,8 @@ def bounded(model, true, allowed, start=(1.0, 1.0), variance=0.086):
     power = model(*true)
     noise = Noise(np.zeros_like(power), np.full(power.shape, variance), np.zeros(1, bool))
     data = Measured(power, noise, np.ones(power.shape, bool), 0.0)
-    return CalibrationFit(("a", "b"), np.array(start), data, pictures, CalibrationSettings().for_noise(1e-3)).solved()
+    names = tuple("abc"[: len(start)])
+    return CalibrationFit(names, np.array(start), data, pictures, CalibrationSettings().for_noise(1e-3)).solved()
 
 
 @pytest.mark.parametrize("start", [(1.0, 1.0), (1.2, 1.05)])
@@ -249,6 +250,17 @@ def test_a_border_of_a_combination_is_told_of_both():
     found = bounded(lambda a, b: a * one + b * other, (3, 3), lambda a, b: a + b < 2.5)
     assert found.values.sum() == pytest.approx(2.5, abs=0.05)
     assert [line[:14] for line in found.borders] == ["'a' ended at 1", "'b' ended at 1"]
+
+
+def test_a_parameter_that_has_no_part_in_a_border_is_fitted_on():
+    """As before, from the border, beside a third parameter at 5. Seen to fail: held at its start, with a line, too."""
+    parts = np.random.default_rng(1).random((3, 1, 8, 8))
+    model = lambda *of: np.tensordot(of, parts, 1)  # noqa: E731
+    found = bounded(model, (3, 3, 5), lambda a, b, _: a + b < 2.5, (1.25, 1.2499, 1.0), 1e-3)
+    basis = parts.reshape(3, -1).T
+    rest = basis @ [3, 3, 5] - basis[:, :2] @ found.values[:2]
+    assert found.values[2] == pytest.approx(rest @ basis[:, 2] / (basis[:, 2] @ basis[:, 2]), abs=0.01)
+    assert [line[:3] for line in found.borders] == ["'a'", "'b'"]
 
 
 def test_variances_of_counts_follow_the_fitted_signal(scene):
