@@ -63,7 +63,7 @@ def explain(
 
     Of PHANTOM.ply, the scene is that of 'fspt render PHANTOM.ply'.
     """
-    with progress_bar(quiet):
+    with progress_bar(quiet) as progress:
         from ..rendering.render import warnings_of
         from ..rendering.scene import load
         from ..studies.explain import HEADER, WORK_HEADER, explain, work
@@ -71,8 +71,8 @@ def explain(
         quiet_mitsuba()
         given = one_scene(scene, definitions(define), framing_of(view, focal_length, f_number, camera))
         loaded = load(given.scene, **given.parameters)
-        rows = explain(loaded, sensor=sensor, rtol=rtol, domain=domain)
-        steps = work(loaded, sensor=sensor, rtol=rtol, domain=domain)
+        rows = explain(loaded, sensor=sensor, rtol=rtol, domain=domain, progress=progress)
+        steps = work(loaded, sensor=sensor, rtol=rtol, domain=domain, progress=progress)
         warnings = [*warnings_of(loaded, sensor), *filter(None, [given.warning])]
     table = "\n".join(
         [HEADER, *(row.render_text() for row in rows), "", WORK_HEADER, *(step.render_text() for step in steps)]

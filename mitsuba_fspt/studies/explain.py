@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..integral.lines.left_out import LeftOut
     from ..integral.quadrature import Quadrature
     from ..integral.solution import Solution
+    from ..runtime.progress_bar import Progress
 
 ROUNDS = 3  # timed pairs of runs, of which the median counts; only one where a run takes longer than LONG [s]
 LONG = 5.0
@@ -107,12 +108,14 @@ def explain(
     sensor: int = 0,
     rtol: float | None = None,
     domain: str | None = None,
+    progress: Progress | None = None,
 ) -> list[Explanation]:
     """One row for every computation that the integral may leave out in a scene.
 
-    Each shortcut that is taken is switched off in turn, to measure how many lines of sight and how much time it saves.
-    Parameters and errors are those of `render`.
+    Each shortcut that is taken is switched off in turn, to measure how many lines of sight and how much time it saves:
+    three to seven images for each. Parameters and errors are those of `render`.
     """
+    report = progress or (lambda what, share: None)
     scene = loaded(scene)
     variant = backend.ensure_variant()
     lens, integrator, quadrature = _parts(scene, sensor, rtol, domain)
@@ -124,7 +127,8 @@ def explain(
 
     solution, _ = solve(quadrature)
     rows = []
-    for finding in solution.findings:
+    for k, finding in enumerate(solution.findings):
+        report(f"timing without a shortcut: {SHORTCUTS[finding.name]}", (1 + k) / (1 + len(solution.findings)))
         without = replace(quadrature, shortcuts_off=quadrature.shortcuts_off | {finding.name})
         saved = _saved(solve, quadrature, without) if finding.taken else ()
         rows.append(_row(finding, *saved))
@@ -139,6 +143,7 @@ def work(
     sensor: int = 0,
     rtol: float | None = None,
     domain: str | None = None,
+    progress: Progress | None = None,
 ) -> list[Work]:
     """One row for every step of the integration, in order, then the `DEAREST` pixels; parameters as of `explain`.
 
@@ -149,7 +154,10 @@ def work(
     lens, integrator, quadrature = _parts(scene, sensor, rtol, domain)
     from ..camera.of_sensor import camera_of
 
+    report = progress or (lambda what, share: None)
+    report("timing steps", 0.0)
     integrator.solve(scene, lens, quadrature)
+    report("timing steps", 0.5)
     log = WorkLog(camera_of(lens).pixel_pitch)
     integrator.solve(scene, lens, quadrature, log=log)
     steps = [Work(name, *numbers) for name, numbers in log.steps.items()]

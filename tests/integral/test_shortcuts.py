@@ -213,7 +213,11 @@ def test_an_unknown_shortcut_is_refused():
 
 
 def test_explain_measures_what_each_shortcut_saves():
-    rows = fspt.explain(world_scene(ball(), sensor=lens(20, 1.6, f_number=2.8)), rtol=RTOL)
+    stages = []
+    scene = world_scene(ball(), sensor=lens(20, 1.6, f_number=2.8))
+    rows = fspt.explain(scene, rtol=RTOL, progress=lambda what, share: stages.append((share, what)))
+    assert [share for share, _ in stages] == sorted(share for share, _ in stages)
+    assert f"timing without a shortcut: {SHORTCUTS['outside']}" in [what for _, what in stages]
     by_what = {row.what: row for row in rows}
     outside, one = by_what[SHORTCUTS["outside"]], by_what[SHORTCUTS["one line"]]
     assert outside.left_out
@@ -252,9 +256,9 @@ def once(function):
     """The function, whose first result is that of all later calls, which must have the same numbers and words."""
     kept = []
 
-    def call(*arguments, **named):
+    def call(*arguments, progress, **named):
         if not kept:
-            kept.extend((function(*arguments, **named), named))
+            kept.extend((function(*arguments, progress=progress, **named), named))
         assert named == kept[1]
         return kept[0]
 
