@@ -26,6 +26,7 @@ from . import pupil_cells
 
 CORNERS = ((0, 0), (1, 0), (0, 1))  # of a face, in the square that `Elements.place` maps to it
 MARGIN, RIM = 0.05, 0.02  # by which bounds exceed the light: in pixels, for float32, and of the blur radius, for cells
+LONGER = 4.0  # length of a slender piece in a shadow over that of a compact one, at the most
 FEWEST_SHADED = 2  # pieces along a side where one surface may hide another: with half of them the light differs
 # What middles of M × M cells leave of a half plane averaged over pixels, times r/M² of its step for a blur disc of r
 # pixels: the most of all directions and offsets for r = 0.5 … 32, M = 4 … 32 and M > 1.25 r, below which it is 0.18.
@@ -71,10 +72,9 @@ class ColumnRule(Thresholds):
     perspective : J_n that perspective, corrected on average, misplaces within a piece, over its change along the face:
         pieces along a side of a face of relative depth δ are √(PERSPECTIVE_LEFT · δ/perspective), fewer where the blur
         disc evens it out
-    shadow : largest piece s [pixels] where one surface may hide another: each is lit or not on a line of sight. On
-        faces of a pixels, smaller than their blur disc, the light displaced so over that of the column, times the
-        distance [pixels], is w · s²/a, with w the share of the lines of sight of which the edge of a shadow crosses
-        them; it is at most the mean of s² over pieces of any size up to the largest, a third of its square
+    shadow : largest piece s [pixels] where one surface may hide another: each is cut once, along the edge of the
+        shadow, and a second edge or a corner of it misplaces light within the piece. Slender ones, of less than half
+        their length in height, are longer, up to `LONGER` s, and have no larger area than others
     """
 
     step: float = bound(1e-3, 1e30)
@@ -290,7 +290,9 @@ class FaceLight:
         contrast : largest change of the light along a face, for an image; None for columns
         """
         sides = np.minimum(self.sides, LONGEST)
-        shaded = np.where(self.mixed & ~self.small, np.maximum(sides / rule.shadow, FEWEST_SHADED), 0)
+        slender = np.sqrt(np.divide(2 * self.heights, sides, out=np.ones_like(sides), where=sides > 0))
+        shaded = np.maximum(slender.clip(1 / LONGER, 1) * sides / rule.shadow, FEWEST_SHADED)
+        shaded = np.where(self.mixed & ~self.small, shaded, 0)
         pieces = np.ceil(np.maximum(shaded, sides / (rule.piece * self.distance)))
         pieces = np.maximum(pieces, np.minimum(self._flat_pieces(rule, 1.0 if contrast is None else contrast), sides))
         if self.shift.any():
