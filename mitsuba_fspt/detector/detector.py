@@ -24,12 +24,12 @@ from ..images.exposure import Exposure
 from ..images.formats import Metadata
 from ..images.image import Image
 from ..images.noise_model import TYPICAL
-from ..images.pixel_axes import CROP
-from ..images.recorded_number import recorded_number, recorded_positive
+from ..images.recorded_number import recorded_positive
 from ..optics.light import Light, Spectrum
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number, whole
 from .parameters import RECORDED, DetectorParameters
+from .read_out import binned_pixels
 from .reduction import Corrections, Exposed, light_of, reduce_counts
 from .stray_light import StrayLight, tell_part
 
@@ -336,7 +336,7 @@ class Detector(DetectorParameters):
             "saturated_pixels": int(np.sum(full | (counts >= top))),
         }
         metadata |= light.metadata() | self._recorded(light) | self.stray_light.recorded(counts.shape)
-        return Exposure(electrons, counts.astype(np.uint16), metadata | _pixels_read_out(image, binning))
+        return Exposure(electrons, counts.astype(np.uint16), metadata | binned_pixels(image.metadata, binning))
 
     def _recorded(self, light: Light) -> Metadata:
         """Parameters as entries of an exposure's metadata: numbers, of maps the mean with path and digest.
@@ -367,17 +367,6 @@ def _binned(charge: NDArray[np.float64], binning: int) -> NDArray[np.float64]:
         )
     blocks = charge.reshape(height // binning, binning, width // binning, binning)
     return blocks.sum(axis=(1, 3))
-
-
-def _pixels_read_out(image: Image, binning: int) -> Metadata:
-    """Entries of the metadata about the pixels that are read out: their pitch and crop window."""
-    found: Metadata = {}
-    if (pitch := _pitch(image)) is not None:
-        found["pixel_pitch"] = pitch * binning
-    if binning > 1:  # of a crop window, in pixels of the read-out
-        own = {key: recorded_number(image.metadata, key, math.nan) for key in CROP}
-        found |= {key: value / binning for key, value in own.items() if not math.isnan(value)}
-    return found
 
 
 def _pitch(image: Image) -> float | None:

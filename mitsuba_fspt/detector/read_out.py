@@ -9,7 +9,7 @@ from ..images.formats import Metadata
 from ..images.frame_file import SAME_PITCH
 from ..images.pixel_axes import CROP
 from ..images.recorded_number import recorded_number, recorded_positive
-from ..runtime.errors import DetectorError
+from ..runtime.errors import DetectorError, FsptError, ImageError
 from ..runtime.numbers import whole
 
 THING = "reduce: the image"
@@ -39,9 +39,23 @@ def pixels_read_out(
     side = pitch or _side(known, before, before if binning is None else binning, own)
     # Binnings are whole numbers; a pitch may differ by its measurement as well, which moves no pixel.
     larger = max(round(side / known), 1) / max(round(known / side), 1)
-    window = {key: recorded_number(metadata, key, 0.0, THING, DetectorError) for key in CROP if key in metadata}
-    places = {} if larger == 1 else {key: value / larger for key, value in window.items()}
-    return binning, side, {**metadata, **places}
+    return binning, side, {**metadata, **_window(metadata, larger, THING, DetectorError)}
+
+
+def binned_pixels(metadata: Mapping[str, Any], binning: int) -> Metadata:
+    """Entries of the metadata of an exposure about the pixels read out, `binning` a side: their pitch and crop window.
+
+    metadata : of the image that is exposed
+    """
+    pitch = recorded_positive(metadata, "pixel_pitch")
+    found: Metadata = {} if pitch is None else {"pixel_pitch": pitch * binning}
+    return found | _window(metadata, binning, "image", ImageError)
+
+
+def _window(metadata: Mapping[str, Any], larger: float, thing: str, error: type[FsptError]) -> Metadata:
+    """Crop window of the metadata in pixels with `larger` sides; empty without one and for the same pixels."""
+    window = {key: recorded_number(metadata, key, 0.0, thing, error) for key in CROP if key in metadata}
+    return {} if larger == 1 else {key: value / larger for key, value in window.items()}
 
 
 def _side(known: float, before: int, binning: int, own: float | None) -> float:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import LONGEST_TEXT, BackendError, ImageError, one_line
+from .formats.fits import BOTTOM_UP, ROW_ORDER, TOP_DOWN
 from .tiff_pages import read_tiff, tell_left_out
 
 LOG = logging.getLogger("mitsuba_fspt")
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
 UM_PER_MM = 1e3
-ROW_ORDER, BOTTOM_UP = "ROWORDER", "BOTTOM-UP"
 UNIT = "BUNIT"
 # Of FITS headers: numbers, each with its rule for messages and whether a value keeps it; and texts.
 NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
@@ -141,7 +141,7 @@ def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
         raise ImageError(f"{thing}: has pixels of {wide:g} x {high:g} um. Give a frame of square pixels.")
     sides, pitch = columns or rows, wide or high
     order = str(header[ROW_ORDER]).strip().upper()
-    found: dict[str, Any] = {"top_row": {"TOP-DOWN": FIRST, BOTTOM_UP: LAST}.get(order)}
+    found: dict[str, Any] = {"top_row": {TOP_DOWN: FIRST, BOTTOM_UP: LAST}.get(order)}
     time = numbers["EXPOSURE"] if numbers["EXPTIME"] is None else numbers["EXPTIME"]
     found |= {} if time is None else {"exposure_time": time}
     found |= {} if sides is None else {"binning": int(sides)}
