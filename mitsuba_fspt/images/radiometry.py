@@ -111,12 +111,13 @@ def etendue_of(shape: tuple[int, int], known: Metadata) -> Plane:
             "as fspt rendered it."
         )
     names = [name for name in number_names() if name in known and name not in DERIVED]
+    focal_length, *values = (recorded_number(known, name, math.nan) for name in ("focal_length", *names))
     try:
         lens = Lens.focused(
-            recorded_number(known, "focal_length", math.nan),
+            focal_length,
             model=str(known.get("model", "diaphragm")),
             distortion=known.get("distortion"),
-            **{name: recorded_number(known, name, math.nan) for name in names},  # type: ignore[arg-type]
+            **dict(zip(names, values, strict=True)),  # type: ignore[arg-type]
         )
     except (OpticsError, TypeError, ValueError) as cause:
         raise ImageError(f"image: its metadata describe no lens: {cause}") from cause

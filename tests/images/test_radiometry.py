@@ -134,6 +134,13 @@ def test_metadata_of_no_lens():
         etendue(fspt.Image([[1.0]], metadata=known))
 
 
+def test_numbers_of_the_metadata_that_are_none_are_told_once():
+    """Seen to fail: "image: its metadata describe no lens: image: 'focal_length' …"."""
+    known = {"focal_length": "abc", "f_number": 8, "focus_distance": 165, "pixel_pitch": 0.4}
+    with pytest.raises(ImageError, match=r"^image: 'focal_length' of the metadata must be a finite number, got 'abc'"):
+        etendue(fspt.Image(np.ones((4, 4)), metadata=known))
+
+
 def test_the_wavelength_of_a_filter_is_that_of_the_image():
     """Another one would use the transmittance of the first: a wrong number without a word."""
     image = fspt.Image([[1e-12]], metadata={"wavelength_nm": 600.0, "pixel_pitch": 0.0135})
