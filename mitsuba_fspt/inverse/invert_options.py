@@ -14,6 +14,7 @@ from .surface import CREASE_ANGLE
 from .transport_matrix import TransportMatrix
 from .view_factors import checked_factor
 
+CONFIDENCE = 0.9
 # Options without an effect on 'mlem', and the values that they may have there.
 UNUSED: dict[str, tuple[object, ...]] = {
     "weight": (None, 0.0),
@@ -21,7 +22,7 @@ UNUSED: dict[str, tuple[object, ...]] = {
     "crease_angle": (CREASE_ANGLE,),
     "samples": (0,),
     "seed": (0,),
-    "confidence": (0.9,),
+    "confidence": (CONFIDENCE,),
     "gain_per_view": (0.0,),
 }
 MOST_SAMPLES = 1_000_000
@@ -72,7 +73,7 @@ class Options:
         self._require_samples()
 
     def _require_samples(self) -> None:
-        """Raise InversionError for fewer draws than intervals of the confidence need, and for a seed without draws.
+        """Raise InversionError for fewer draws than intervals of the confidence need; seed, confidence without draws.
 
         The next draw lies between the least and the largest of n with the probability (n - 1)/(n + 1).
         """
@@ -84,10 +85,11 @@ class Options:
                 f"{100 * self.confidence:.9g} %. Give samples = {least} or more, a lower confidence, or 0 for no "
                 "intervals."
             )
-        if self.seed and not self.samples:
-            raise InversionError(
-                f"invert: 'seed' = {self.seed} has no effect without 'samples'. Give both, or leave it out."
-            )
+        for name, usual in (("seed", 0), ("confidence", CONFIDENCE)):
+            if (given := getattr(self, name)) != usual and not self.samples:
+                raise InversionError(
+                    f"invert: '{name}' = {given:g} has no effect without 'samples'. Give both, or leave it out."
+                )
 
     def _require_effect(self) -> None:
         """Raise InversionError for an option that has no effect on the method 'mlem'."""

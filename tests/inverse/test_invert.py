@@ -454,6 +454,7 @@ BAD = [
     ({"samples": 18}, "'samples' = 18 intervals hold 89.5 % at most.* samples = 19 or more"),
     ({"samples": 100, "confidence": 0.99}, "hold 98 % at most, 'confidence' is 99 %. Give samples = 199 or more"),
     ({"seed": 1}, "'seed' = 1 has no effect without 'samples'"),
+    ({"confidence": 0.5}, "'confidence' = 0.5 has no effect without 'samples'"),
     ({"samples": 2.5}, "'samples'"),
     ({"confidence": 1.0}, "'confidence'"),
     ({"gain_error": 1.5}, "'gain_error'"),
