@@ -194,7 +194,7 @@ def test_steps_to_values_that_a_scene_refuses_are_made_shorter():
     assert fit.solved().values[0] == pytest.approx(0.5, abs=1e-4)
 
 
-def bounded(model, true, allowed, start=(1.0, 1.0), variance=0.086):
+def bounded(model, true, allowed, start=(1.0, 1.0), variance=0.086, gain_error=0.0):
     """Fit of the parameters a, b … of images by a `model`, of which those not `allowed` are refused."""
 
     def pictures(values):
@@ -205,7 +205,7 @@ def bounded(model, true, allowed, start=(1.0, 1.0), variance=0.086):
 
     power = model(*true)
     noise = Noise(np.zeros_like(power), np.full(power.shape, variance), np.zeros(1, bool))
-    data = Measured(power, noise, np.ones(power.shape, bool), 0.0)
+    data = Measured(power, noise, np.ones(power.shape, bool), gain_error)
     names = tuple("abc"[: len(start)])
     return CalibrationFit(names, np.array(start), data, pictures, CalibrationSettings().for_noise(1e-3)).solved()
 
@@ -230,6 +230,21 @@ def test_a_parameter_ends_at_the_border_of_what_a_scene_allows(blend, start):
     assert line.startswith("'b' ended at 1.0")
     assert ": the second must be <= 1.05, got 1.0" in line
     assert float(line.split("lies ")[1].split(" sd")[0]) == pytest.approx(1.95 / np.sqrt(free[1, 1]), abs=0.1)
+
+
+def test_the_gain_error_is_part_of_the_distance_to_a_minimum_beyond_a_border():
+    """Parameters at 2 and 3, of which the second may be up to 1.05, with a gain known to 30 %: by Eq. M.26 a common
+    factor moves them by 2 and 1.05 times it, so that the second's variance is that of the noise and (0.3 · 1.05)².
+
+    Seen to fail: 19 sd with that of the noise alone, 5.9 expected.
+    """
+    one, other = np.random.default_rng(1).random((2, 1, 8, 8))
+    found = bounded(lambda a, b: a * one + b * other, (2, 3), lambda a, b: b <= 1.05, gain_error=0.3)
+    noise = np.linalg.inv([[(p * q).sum() / 0.086 for q in (one, other)] for p in (one, other)])[1, 1]
+    sd = np.sqrt(noise + (0.3 * found.values[1]) ** 2)
+    assert np.sqrt(found.covariance[1, 1]) == pytest.approx(sd, rel=1e-4)
+    (line,) = found.borders
+    assert float(line.split("lies ")[1].split(" sd")[0]) == pytest.approx((3 - found.values[1]) / sd, abs=0.06)
 
 
 def test_a_border_is_left_where_the_minimum_lies_inside():
