@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FIRST, FITS, LAST, SAME_PITCH, TIFF, read_frame, tell_open_rows
+from ..images.frame_file import FIRST, FITS, LAST, SAME_PITCH, TIFF, read_frame, shown_sides, tell_open_rows
 from ..images.tiff_pages import channels_of, read_tiff
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
@@ -27,6 +27,7 @@ UNEQUAL, UNEQUAL_BY_NOISE, UNEQUAL_BY_DRIFT = 0.2, 10.0, 1.0
 BRIGHT = 99.9  # percentile at which the pixels of a frame are cut off for its mean: cosmic rays are no light
 DN = ("", "dn", "adu", "count", "counts", "ct")  # names of it in BUNIT
 WRAPPED = -(2**14)  # DN of 16 bits with a sign: lower ones are no dark counts, but wrapped ones of 32768 … 49151
+EMPTY = -(2**15)  # least number of 16 bits with a sign, by which programs mark pixels without a value
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
@@ -54,6 +55,7 @@ class Counts:
     exposure_time : [s], None if the file does not state it
     binning : side of the square of pixels read out as one, None if the file does not state it
     pixel_pitch : of the pixels read out [mm], None if the file does not state it
+    pixel_sides : their width and height [mm], if the file states that they are not square; else None
     top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
     unit : of the values by the file, None if it does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
@@ -73,6 +75,7 @@ class Counts:
     levels: NDArray[np.float64] | None = None
     top_row: str | None = FIRST
     unit: str | None = None
+    pixel_sides: tuple[float, float] | None = None
 
 
 def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:
@@ -99,6 +102,8 @@ def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float |
 
     time : exposure time [s];  binning : None for 1, which nothing states
     pitch, own : of the pixels read out and of the detector's own pixels [mm], or None
+
+    Raises ImageError where only the file states the sides of the pixels, and they are not square.
     """
     side = own * (binning or 1) if pitch is None and own is not None else pitch
     for name, used, stated, unit, same in (
@@ -111,6 +116,8 @@ def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float |
                 "fspt: reduce: '%s' is %g%s, the file of the counts states %g%s. The former is used.",
                 *(name, used, unit, stated, unit),
             )
+    if counts.pixel_sides is not None:
+        _tell_sides(counts.pixel_sides, side)
     if pitch and own and binning and abs(pitch - own * binning) > SAME_PITCH * own * binning:
         LOG.warning(
             "fspt: reduce: 'pixel_pitch' is %g mm, that of the detector times the binning of %d is %g mm. The dark "
@@ -119,6 +126,19 @@ def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float |
         )
     _tell_unit(counts)
     tell_open_rows("reduce: the FITS file of the counts", counts.top_row, "in all frames of this camera")
+
+
+def _tell_sides(sides: tuple[float, float], pitch: float | None) -> None:
+    """Say in one line on stderr that the file states pixels of these `sides`; ImageError without a `pitch` [mm]."""
+    if pitch is None:
+        raise ImageError(
+            f"reduce: the file of the counts states pixels of {shown_sides(sides)}. Give a frame of square pixels, or "
+            "'pixel_pitch' if the file is wrong."
+        )
+    LOG.warning(
+        "fspt: reduce: 'pixel_pitch' is %g mm, the file of the counts states %s. The former is used.",
+        *(pitch, shown_sides(sides)),
+    )
 
 
 def _tell_unit(counts: Counts) -> None:
@@ -216,11 +236,8 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
             f"counts '{name}' must be real numbers of shape (h, w) or (frames, h, w), got {array.dtype} of shape "
             f"{array.shape}. Save one channel of grey values."
         )
-    if array.dtype.kind == "i" and array.dtype.itemsize == 2 and (lowest := int(array.min())) < WRAPPED:
-        raise ImageError(
-            f"counts '{name}' of 16 bits with a sign go down to {lowest}: those above 32767 have lost 65536. Save them "
-            "without a sign, in FITS with BZERO = 32768."
-        )
+    if array.dtype.kind == "i" and array.dtype.itemsize == 2:
+        _require_not_wrapped(array[array < WRAPPED], name)
     stack = array.astype(np.float64)
     if not np.isfinite(stack).all():
         raise ImageError(f"counts '{name}' hold {int(np.sum(~np.isfinite(stack)))} NaN or inf. Mask or replace them.")
@@ -236,6 +253,21 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
         raw=raw,
         levels=np.array([np.minimum(frame, np.percentile(frame, BRIGHT)).mean() for frame in stack]),
     )
+
+
+def _require_not_wrapped(low: NDArray[np.int16], name: str) -> None:
+    """Raise ImageError for counts below `WRAPPED` of 16 bits with a sign; all at the least number are marks."""
+    if low.size and (low == EMPTY).all():
+        raise ImageError(
+            f"counts '{name}' hold {low.size} values of {EMPTY}, which marks pixels without a value. Replace them, "
+            "by 0 for example, and mask these pixels by 'bad_pixels'; if counts above 32767 have lost 65536, save "
+            "them without a sign."
+        )
+    if low.size:
+        raise ImageError(
+            f"counts '{name}' of 16 bits with a sign go down to {low.min()}: those above 32767 have lost 65536. Save "
+            "them without a sign, in FITS with BZERO = 32768."
+        )
 
 
 def tell_unequal_frames(counts: Counts, dark: float, noise: float) -> None:
@@ -288,7 +320,11 @@ def _click(folder: Path) -> Counts:
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
     if binning is not None and not (binning >= 1 and binning == int(binning)):
-        raise ImageError(f"'{files[INFO]}' states a binning of {binning:g}, no whole number >= 1. Correct it.")
+        LOG.warning(
+            "fspt: '%s' states a binning of %g, no whole number >= 1; it is left out. Correct it, or give the number.",
+            *(files[INFO], binning),
+        )
+        binning = None
     sides = None if binning is None else int(binning)
     bias, background = found.get(BIAS), found.get(BACKGROUND)
     return replace(light, bias=bias, background=background, exposure_time=time, info=info, binning=sides)

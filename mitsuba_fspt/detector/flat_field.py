@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 LOG = logging.getLogger("mitsuba_fspt")
 KINDS = ("lens", "sensor")
+PRNU = ("prnu",)  # the map in place of which a flat field is used
 LEAST = 0.05  # of the median response, and of the screen's brightest pixel: darker ones have > 20 times the noise
 HOT = 2.0  # times the median of its 5 × 5 neighbours: an unmasked hot pixel of n changes the mean by less than 1/n
 NEIGHBOURS = 5  # pixels a side
@@ -102,7 +103,7 @@ def flat_field(
     """
     _require_kind(kind, scene)
     found = frame_like(flat, "flat", shape)
-    require_rows_of_maps(detector, "flat", found)
+    require_rows_of_maps(detector, "flat", found, unused=PRNU)
     spurious = detector.spurious_charge * area * detector.em_gain / detector.on_pixels("gain", shape)
     level = detector.on_pixels("bias", shape) + spurious if bias is None else bias  # a frame contains that charge
     background, frames = _background(detector, found, flat_dark, level, shape)
@@ -128,13 +129,14 @@ def flat_field(
     return FlatField(response, ~usable, error, str(kind), found.top_row)
 
 
-def require_rows_of_maps(detector: DetectorParameters, name: str, counts: Counts) -> None:
+def require_rows_of_maps(detector: DetectorParameters, name: str, counts: Counts, unused: tuple[str, ...] = ()) -> None:
     """Raise DetectorError for a map of the detector whose order of rows may be another one than that of counts.
 
-    name : of the counts, for messages
+    name : of the counts, for messages;  unused : names of maps that do not apply to them
     """
     for own, pixels in detector.maps.items():
-        require_same_rows(own, pixels.top_row, name, counts.top_row)
+        if own not in unused:
+            require_same_rows(own, pixels.top_row, name, counts.top_row)
 
 
 def tell_loss(field: FlatField, gain_error: float) -> None:

@@ -46,7 +46,7 @@ from .counts import (
     tell_unequal_frames,
 )
 from .dark_charge import Background, shown_charge
-from .flat_field import FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
+from .flat_field import PRNU, FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .read_out import pixels_read_out
 from .saturation import full_pixels, saturated
@@ -227,7 +227,7 @@ def reduce_counts(
     binning, pitch, metadata = pixels_read_out(metadata or {}, binning, pitch, detector.pixel_pitch)
     tell_stated(raw, exposed.exposure_time, binning, pitch, detector.pixel_pitch)
     exposed = replace(exposed, binning=binning or 1, pixel_pitch=pitch)
-    require_rows_of_maps(detector, "counts", raw)
+    require_rows_of_maps(detector, "counts", raw, unused=() if corrections.flat is None else PRNU)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)

@@ -22,7 +22,7 @@ from scipy.signal import convolve
 
 from ..images.comparison import GLARE, PSF
 from ..images.formats import Metadata, read_planes
-from ..images.frame_file import FIRST, FITS, read_frame, tell_open_rows
+from ..images.frame_file import FIRST, FITS, read_frame, shown_sides, tell_open_rows
 from ..images.pixel_axes import CROP
 from ..images.recorded_number import recorded_number, recorded_positive
 from ..runtime.errors import BackendError, DetectorError, FsptError, ImageError
@@ -118,6 +118,8 @@ def _content(path: Path, thing: str) -> tuple[NDArray[Any], float | None]:
     except FsptError as cause:
         raise DetectorError(str(cause)) from cause
     tell_open_rows(thing, header.get("top_row", FIRST))
+    if "pixel_sides" in header:
+        raise DetectorError(f"{thing}: has pixels of {shown_sides(header['pixel_sides'])}. Give square pixels.")
     return values, header.get("pixel_pitch")
 
 

@@ -34,9 +34,9 @@ FIRST, LAST = "first", "last"  # which row of a file is the top one
 def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Array of a .tif, .fits or .npy file as it is stored, row 0 at the top, and what a FITS header states.
 
-    The header's entries are `exposure_time` [s], `binning`, `pixel_pitch` [mm] and `unit` of the values, as far as it
-    has them, and `top_row`, the row of the file that is the top one: 'first' or 'last', None if the header does not say
-    it.
+    The header's entries are `exposure_time` [s], `binning`, `pixel_pitch` [mm], or of pixels that are not square
+    `pixel_sides`, width and height [mm], and `unit` of the values, as far as it has them, and `top_row`, the row of the
+    file that is the top one: 'first' or 'last', None if the header does not say it.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -131,14 +131,12 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
 def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
     """What the `KEYWORDS` of a FITS header state; one line on stderr says of each that should be a number and is not.
 
-    Raises ImageError for pixels that are not squares of the sensor's.
+    Raises ImageError for a binning that is not square.
     """
     numbers = {key: _number(header[key], key, thing) for key in NUMBERS}
     columns, rows, wide, high = (numbers[key] for key in ("XBINNING", "YBINNING", "XPIXSZ", "YPIXSZ"))
     if columns and rows and columns != rows:
         raise ImageError(f"{thing}: binned {columns:g} x {rows:g}. Give a frame of square binning.")
-    if wide and high and abs(wide - high) > SAME_PITCH * high:
-        raise ImageError(f"{thing}: has pixels of {wide:g} x {high:g} um. Give a frame of square pixels.")
     sides, pitch = columns or rows, wide or high
     order = str(header[ROW_ORDER]).strip().upper()
     found: dict[str, Any] = {"top_row": {TOP_DOWN: FIRST, BOTTOM_UP: LAST}.get(order)}
@@ -146,7 +144,14 @@ def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
     found |= {} if time is None else {"exposure_time": time}
     found |= {} if sides is None else {"binning": int(sides)}
     found |= {} if header[UNIT] is None else {"unit": str(header[UNIT]).strip()}
+    if wide and high and abs(wide - high) > SAME_PITCH * high:
+        return found | {"pixel_sides": (wide / UM_PER_MM, high / UM_PER_MM)}
     return found | ({} if pitch is None else {"pixel_pitch": pitch / UM_PER_MM})
+
+
+def shown_sides(sides: tuple[float, float]) -> str:
+    """Width and height [mm] of pixels that are not square, for messages."""
+    return f"{sides[0]:g} x {sides[1]:g} mm"
 
 
 def _number(value: object, key: str, thing: str) -> float | None:

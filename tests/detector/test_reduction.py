@@ -461,10 +461,11 @@ def test_a_keyword_that_is_no_number_is_left_out(tmp_path, caplog, wrong):
     assert f"XBINNING = {wrong!r} is no whole number >= 1; it is left out" in caplog.text
 
 
-def test_sides_of_pixels_in_fits_files(tmp_path):
-    """One of two keywords is enough; sides that differ by more than rounding are refused.
+def test_sides_of_pixels_in_fits_files(tmp_path, caplog):
+    """One of two keywords is enough; sides that differ by more than rounding are refused where no pitch is given.
 
-    Seen to fail: YBINNING = 2 alone was no binning, 13.5 × 27 µm were passed over, and so were 13.5 × 13.50001.
+    Seen to fail: YBINNING = 2 alone was no binning, 13.5 × 27 µm were passed over, and so were 13.5 × 13.50001; later
+    they were refused beside a given pitch, too, and in frames of which no pitch is used.
     """
     fits = pytest.importorskip("astropy.io.fits")
 
@@ -476,8 +477,14 @@ def test_sides_of_pixels_in_fits_files(tmp_path):
     assert read(YBINNING=2, YPIXSZ=27.0) == (2, 0.027)
     assert read(XBINNING=1.0, XPIXSZ=13.5, YPIXSZ=13.50001) == (1, 0.0135)
     assert read(XPIXSZ=0.0) == (None, None)
-    with pytest.raises(ImageError, match=r"has pixels of 13.5 x 27 um"):
-        read(XPIXSZ=13.5, YPIXSZ=27.0)
+    assert read(XPIXSZ=13.5, YPIXSZ=27.0) == (None, None)
+    path, camera = tmp_path / "a.fits", replace(CCD, pixel_pitch=None)
+    with pytest.raises(ImageError, match=r"states pixels of 0.0135 x 0.027 mm"):
+        camera.reduce(path, **SETTINGS)
+    caplog.clear()
+    found = camera.reduce(path, **SETTINGS, pixel_pitch=0.02, bias=path)
+    assert found.metadata["pixel_pitch"] == 0.02
+    assert "'pixel_pitch' is 0.02 mm, the file of the counts states 0.0135 x 0.027 mm. The former" in caplog.messages[0]
 
 
 def test_counts_in_another_unit_or_with_a_sign_too_many(tmp_path, caplog):
@@ -495,6 +502,10 @@ def test_counts_in_another_unit_or_with_a_sign_too_many(tmp_path, caplog):
     np.save(tmp_path / "wrapped.npy", counts.view(np.int16))
     with pytest.raises(ImageError, match="go down to -25536: those above 32767 have lost 65536"):
         CCD.reduce(tmp_path / "wrapped.npy", **SETTINGS)
+    counts = counts.view(np.int16)
+    counts[:2, 2] = -32768  # seen to fail: told as wrapped, too
+    with pytest.raises(ImageError, match=r"hold 2 values of -32768, which marks pixels without a value. Replace them"):
+        CCD.reduce(counts, **SETTINGS)
 
 
 def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):
@@ -544,6 +555,31 @@ def test_click_info_of_the_luminescent_image(tmp_path):
     assert CCD.reduce(tmp_path, **SETTINGS, binning=4).metadata["binning"] == 4
     (tmp_path / "ClickInfo.txt").write_text(photo + bias + light)
     assert read_counts(tmp_path).exposure_time is None
+
+
+@pytest.mark.parametrize("wrong", ["0", "2.5"])
+def test_a_binning_of_click_info_that_is_none_is_left_out(tmp_path, caplog, wrong):
+    """As in FITS files, with a line. Seen to fail: refused beside a given one, too."""
+    tifffile = pytest.importorskip("tifffile")
+    tifffile.imwrite(tmp_path / "luminescent.TIF", np.full((4, 4), 1000, np.uint16))
+    (tmp_path / "ClickInfo.txt").write_text(f"Binning Factor:\t{wrong}\n")
+    assert CCD.reduce(tmp_path, **SETTINGS, binning=4).metadata["binning"] == 4
+    assert f"ClickInfo.txt' states a binning of {wrong}, no whole number >= 1; it is left out" in caplog.messages[0]
+
+
+def test_a_map_that_a_flat_field_replaces_may_have_other_rows(tmp_path):
+    """`prnu` is BOTTOM-UP, counts and flat state no order: the flat replaces the map. Seen to fail: refused."""
+    fits, _ = pytest.importorskip("astropy.io.fits"), pytest.importorskip("ccdproc")
+    response = np.linspace(0.9, 1.1, 12).reshape(3, 4)
+    header = fits.Header({"ROWORDER": "BOTTOM-UP"})
+    fits.PrimaryHDU(response, header).writeto(tmp_path / "prnu.fits")
+    for name, values in (("counts", 900 + 50 * response), ("flat", 1e4 * response)):
+        fits.PrimaryHDU(values.astype(np.uint16)).writeto(tmp_path / f"{name}.fits")
+    camera, counts = replace(CCD, prnu=tmp_path / "prnu.fits"), tmp_path / "counts.fits"
+    given = SETTINGS | SENSOR | {"flat": tmp_path / "flat.fits"}
+    np.testing.assert_array_equal(camera.reduce(counts, **given).power, CCD.reduce(counts, **given).power)
+    with pytest.raises(DetectorError, match="has no ROWORDER, 'prnu' is BOTTOM-UP"):
+        camera.reduce(counts, **SETTINGS)
 
 
 def test_uniform_source_calibrates():

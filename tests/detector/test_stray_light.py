@@ -171,6 +171,10 @@ def test_kernels_of_fits_files_of_other_programs(tmp_path, caplog):
     assert "psf.fits' has no ROWORDER" in caplog.text  # seen to fail: its first row was the top one without a word
     assert kernel.pitch == pytest.approx(0.1)
     np.testing.assert_allclose(kernel.on(0.1), KERNEL / 25)
+    hdu.header["YPIXSZ"] = 200.0
+    hdu.writeto(tmp_path / "psf.fits", overwrite=True)
+    with pytest.raises(DetectorError, match=r"psf.fits': has pixels of 0.1 x 0.2 mm. Give square"):
+        Kernel.read(tmp_path / "psf.fits")
 
 
 def test_toml_both_ways(psf, tmp_path):
