@@ -11,9 +11,10 @@ from ..optics.boundary import boundary_a
 from ..runtime.errors import ExitanceError, FluxError
 from ..runtime.numbers import number
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
+from .formats.stated_units import LENGTH_UNIT, QUANTITY, VALUE_UNIT, require_density_unit, require_length_unit
 from .length_unit import millimetres, own_unit, unit_warning
 from .phantom import UNIT, Phantom, require_finite, require_single, shares
-from .surface_mesh import closure, face_areas
+from .surface_mesh import closure, face_areas, repeated
 
 TISSUE_INDEX = 1.37
 DARK = "exitance is 0 everywhere, the phantom is dark. Check the field's name if it should glow."
@@ -53,8 +54,8 @@ def import_flux(
 
     Raises
     ------
-    FluxError : the input is unreadable or contradictory, the faces of a closed surface point inward, or their
-        orientations are inconsistent.
+    FluxError : the input is unreadable or contradictory, in other units than it states, the faces of a closed surface
+        point inward, or twice the same, or their orientations are inconsistent.
     ExitanceError : values are NaN or infinite, or negative without `clip`; J_n beyond single precision.
     BackendError : the format needs an optional package.
     """
@@ -72,7 +73,7 @@ def import_flux(
     with np.errstate(over="ignore"):  # require_single refuses inf
         exitance, provenance = _exitance(raw, found, scale, a, n)
     require_single(exitance)
-    provenance = {"source": source, **provenance, **_unit_entries(found, unit, given=length_unit is not None)}
+    provenance = {"source": source, **provenance, **_checked_unit(raw, found, unit, given=length_unit is not None)}
     exitance, negatives, removed = _without_negatives(found, exitance, clip)
     if not exitance.any():
         provenance["warning"] = " ".join([*([provenance["warning"]] if "warning" in provenance else []), DARK])
@@ -81,8 +82,14 @@ def import_flux(
     return phantom
 
 
-def _unit_entries(found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
-    """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size."""
+def _checked_unit(raw: RawMesh, found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
+    """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size.
+
+    Raises FluxError where the file states other units.
+    """
+    require_length_unit(raw.source, raw.stated.get(LENGTH_UNIT), unit)
+    for text in (raw.stated.get(VALUE_UNIT, ""), "" if raw.quantity == "power" else found.label):
+        require_density_unit(raw.source, text, unit)
     scaled = f"{unit}, by the standard of its format; scaled to mm, values from W/{unit}^2 to W/mm^2"
     entries = {} if given or unit == "mm" else {"mesh_unit": scaled}
     with np.errstate(over="ignore"):  # Phantom refuses vertices so far away
@@ -109,6 +116,8 @@ def _exitance(
     values = found.values / scale**2
     if a is None:
         return values, {}
+    if raw.stated.get(QUANTITY) == "exitance":
+        raise FluxError(f"{raw.source}: its values are J_n by the file, and no fluence. Leave out --a.")
     factor, description = _boundary_factor(a, n, found, raw.source)
     return values / (2 * factor), {"boundary_factor": description}
 
@@ -132,7 +141,15 @@ def _boundary_factor(
 
 
 def _require_outward(phantom: Phantom, flip: bool) -> None:
-    """Raise FluxError for inconsistent orientations and for a closed surface with inward faces: they would be dark."""
+    """Raise FluxError for inconsistent orientations and for a closed surface with inward faces: they would be dark.
+
+    Also for faces that are there more than once, each of which would count in the power.
+    """
+    if again := repeated(phantom.vertices, phantom.faces):
+        raise FluxError(
+            f"mesh: {again} of its {len(phantom.faces)} faces repeat another one, so that their power would count "
+            "again. Remove them, for example by trimesh's mesh.update_faces(mesh.unique_faces())."
+        )
     shape = phantom.closure
     if shape.twisted:
         raise FluxError(

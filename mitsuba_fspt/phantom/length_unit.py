@@ -36,10 +36,10 @@ def likelier_unit(length: float) -> str | None:
     return next((unit for unit, factor in MILLIMETRES.items() if USUAL[0] <= length * factor <= USUAL[1]), None)
 
 
-def unit_warning(diagonal: float, length_unit: str) -> str | None:
+def unit_warning(diagonal: float, length_unit: str, option: str = "--length-unit {}") -> str | None:
     """Warning of a mesh that is too small or too large for a phantom, with a more likely unit; None for a usual size.
 
-    diagonal : of the bounding box [mm], with the mesh in `length_unit`
+    diagonal : of the bounding box [mm], with the mesh in `length_unit`;  option : by which the unit `{}` is given
     """
     if is_usual(diagonal):
         return None
@@ -47,6 +47,6 @@ def unit_warning(diagonal: float, length_unit: str) -> str | None:
     better = likelier_unit(raw)
     found = f"the mesh is {diagonal:.3g} mm from corner to corner if its unit is {length_unit}"
     if better is None:
-        return f"{found}, unusual for a phantom. Check --length-unit, or scale the mesh."
+        return f"{found}, unusual for a phantom. Check {option.split()[0]}, or scale the mesh."
     size = raw * MILLIMETRES[better]
-    return f"{found}, and {size:.3g} mm if it is {better}. If that is right give --length-unit {better}."
+    return f"{found}, and {size:.3g} mm if it is {better}. If that is right give {option.format(better)}."

@@ -127,6 +127,17 @@ def closure(points: Points, faces: Indices) -> Closure:
     return Closure(True, 0, inside_out, pieces)
 
 
+def repeated(points: Points, faces: Indices) -> int:
+    """Number of faces that repeat another one, with the same corners and the same outward side."""
+    faces = _bounding(points, faces)
+    first = faces.argmin(axis=1)[:, None]
+    corners = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.uint64)
+    key = np.zeros(len(faces), np.uint64)
+    for corner in corners.T:
+        key = _mixed(key + corner + np.uint64(1))
+    return len(key) - len(np.unique(key))
+
+
 def turned_share(points: Points, faces: Indices) -> float:
     """Share of the area whose faces point to the wrong side, 0 … 1, on a surface with inconsistent orientations.
 

@@ -5,6 +5,7 @@ Border triangles of either stand for a smooth surface through their vertices (`s
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Iterator
@@ -17,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..phantom.formats import read_mesh
-from ..phantom.length_unit import millimetres
+from ..phantom.formats.stated_units import LENGTH_UNIT, require_length_unit
+from ..phantom.length_unit import millimetres, own_unit, unit_warning
 from ..phantom.surface_mesh import boundary, closure
 from ..runtime.errors import BackendError, FluxError
 from .smooth_surface import SmoothSurface
 from .tetrahedra import Tetrahedra, require_few
 
+LOG = logging.getLogger("mitsuba_fspt")
 ENVELOPE = 20  # edge over the largest distance between mesher's border and surface; later the border is moved onto it
 ROUNDS = 5  # of moving vertices back whose move has flattened or inverted a cell
 CRUSHED = 0.3  # least ratio of a cell's signed volumes after and before the move
@@ -31,21 +34,29 @@ Index = NDArray[np.int64]
 
 
 def read_tetrahedra(
-    path: str | os.PathLike[str], edge: float, length_unit: str = "mm", labels: str | None = None
+    path: str | os.PathLike[str], edge: float, length_unit: str | None = None, labels: str | None = None
 ) -> Tetrahedra:
     """Tetrahedra of a file; if it holds a closed surface, tetrahedra with edges of about `edge` [mm] that fill it.
 
-    `labels` : name of the file's field of whole numbers, one per tetrahedron, used unchanged as the mesh's regions.
+    length_unit : 'mm', 'cm' or 'm'; None: m of a glTF file (.glb, .gltf), else mm. A size that is unusual for a phantom
+        is told in a line on stderr.
+    labels : name of the file's field of whole numbers, one per tetrahedron, used unchanged as the mesh's regions
+
     Any format of `fspt flux import` can be read.
 
     Raises
     ------
-    FluxError : the file cannot be read, its surface is open, or it lacks the field of labels.
+    FluxError : the file cannot be read, states another unit, its surface is open, or it lacks the field of labels.
     BackendError : a package to read or to mesh it is missing.
     """
-    scale = millimetres(length_unit, "geometry")
+    unit = own_unit(path) if length_unit is None else length_unit
+    scale = millimetres(unit, "geometry")
     raw = read_mesh(path, None, None, "auto")
+    require_length_unit(f"geometry: {raw.source}", raw.stated.get(LENGTH_UNIT), unit)
     points = raw.points * scale
+    diagonal = float(np.linalg.norm(np.ptp(points[raw.cells].reshape(-1, 3), axis=0)))
+    if warning := unit_warning(diagonal, unit, 'length_unit = "{}"'):
+        LOG.warning("fspt: geometry: %s: %s", raw.source, warning)
     if raw.cells.shape[1] == 3:
         if labels is not None:
             raise FluxError(

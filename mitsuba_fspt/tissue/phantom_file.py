@@ -68,10 +68,10 @@ class CylinderGeometry:
 
 @dataclass(frozen=True)
 class MeshGeometry:
-    """Tetrahedra or a closed surface in a file, in `length_unit`; `labels`: name of the field that labels its cells."""
+    """Tetrahedra or a closed surface in a file, in `length_unit` or its own; `labels`: field that labels its cells."""
 
     path: Path
-    length_unit: str = "mm"
+    length_unit: str | None = None
     labels: str | None = None
 
     def mesh(self, edge: float) -> Tetrahedra:
@@ -225,7 +225,7 @@ def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
     """Geometry of the table [geometry]."""
     if "file" in table.left:
         result: CylinderGeometry | MeshGeometry = MeshGeometry(
-            folder / table.text("file"), table.text("length_unit", "mm"), table.optional_text("labels")
+            folder / table.text("file"), table.optional_text("length_unit"), table.optional_text("labels")
         )
     else:
         table.choice("shape", ("cylinder",))

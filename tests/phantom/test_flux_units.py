@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 from mitsuba_fspt.cli import run as cli
 from mitsuba_fspt.cli.flux import app
 from mitsuba_fspt.phantom.flux_import import import_flux
+from mitsuba_fspt.phantom.formats.ply import write_ply
 from mitsuba_fspt.runtime.errors import BackendError, ExitanceError, FluxError
 
 BOX = trimesh.creation.box((2.0, 3.0, 4.0))
@@ -317,6 +319,63 @@ def test_broken_mesh_files_give_one_line(tmp_path, suffix, content, capfd):
         import_flux(path, np.ones(8))
     assert "\n" not in str(caught.value)
     assert "".join(capfd.readouterr()) == ""
+
+
+STATED = [
+    ("W/cm^2", "mm", "W/cm^2"),
+    ("mW/mm2", "mm", "mW/mm2"),
+    ("W_per_cm2", "mm", "W_per_cm2"),
+    ("W m⁻²", "cm", "W m⁻²"),
+    ("W/mm²/sr", "mm", "W/mm²/sr"),
+    ("W/mm²", "mm", None),
+    ("W·cm-2", "cm", None),
+    ("W/mm^2 or W/cm^2", "mm", None),
+    ("row/mm2", "mm", None),
+]
+
+
+@pytest.mark.parametrize(("unit", "length_unit", "refused"), STATED)
+def test_values_in_another_unit_than_their_name_states(tmp_path, unit, length_unit, refused):
+    """In the header of a table and as the name of an array. Seen to fail: a power 100 or 1000 times too large."""
+    (tmp_path / "jn.csv").write_text(f"Jn [{unit}]\n" + "1.5\n" * 8)
+    np.savez(tmp_path / "box.npz", vertices=VERTICES, faces=FACES, **{f"jn {unit}": np.full(8, 1.5)})
+    for given in ((MESH, tmp_path / "jn.csv"), (tmp_path / "box.npz",)):
+        if refused is None:
+            assert (import_flux(*given, length_unit=length_unit).power > 0) is True
+            continue
+        with pytest.raises(FluxError, match=rf"values are in '{re.escape(refused)}' by .*taken for W/{length_unit}\^2"):
+            import_flux(*given, length_unit=length_unit)
+
+
+def test_meshes_in_another_unit_than_their_file_states(tmp_path):
+    """Names of an .npz and comments of a PLY. Seen to fail: read in mm, and the other way, without a word."""
+    np.savez(tmp_path / "box.npz", vertices_cm=VERTICES, faces=FACES, jn=np.ones(8))
+    import_flux(MESH, np.ones(8)).write(tmp_path / "box.ply")
+    for name, unit, other in (("box.npz", "cm", "mm"), ("box.ply", "mm", "cm")):
+        with pytest.raises(FluxError, match=rf"vertices are in '{unit}' by the file.*Give --length-unit {unit}"):
+            import_flux(tmp_path / name, length_unit=other)
+        assert import_flux(tmp_path / name, length_unit=unit).power == pytest.approx(52)
+    write_ply(tmp_path / "cm.ply", VERTICES, FACES, {"jn_x": np.ones(8)}, "vertex", {"unit": "W/cm^2"})
+    with pytest.raises(FluxError, match=r"its values are in 'W/cm\^2'"):
+        import_flux(tmp_path / "cm.ply")
+    with pytest.raises(FluxError, match="its values are J_n by the file, and no fluence"):
+        import_flux(tmp_path / "box.ply", a="robin")
+    assert import_flux(tmp_path / "box.ply", np.ones(8), a=1.0).power == pytest.approx(26)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_faces_that_are_there_twice_are_refused(apart):
+    """With the same corners or with vertices of their own; a sheet may have a face on either side.
+
+    Seen to fail: twice the power, without a word.
+    """
+    more = 8 if apart else 0
+    again = np.roll(FACES[3:5], 1, axis=1) + more
+    mesh = np.tile(VERTICES, (1 + apart, 1)), np.concatenate([FACES, again])
+    with pytest.raises(FluxError, match="2 of its 14 faces repeat another one"):
+        import_flux(mesh, np.ones(8 + more))
+    sheet = FACES[:2], FACES[:2, ::-1]
+    assert import_flux((VERTICES, np.concatenate(sheet)), np.ones(8)).area > 0
 
 
 def run(*arguments):

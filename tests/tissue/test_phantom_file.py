@@ -18,6 +18,7 @@ from mitsuba_fspt.optics.boundary import boundary_a
 from mitsuba_fspt.optics.media import Medium, Source
 from mitsuba_fspt.optics.shapes import Cylinder, Sphere
 from mitsuba_fspt.phantom.phantom import Phantom
+from mitsuba_fspt.phantom.surface_mesh import boundary
 from mitsuba_fspt.runtime.errors import BackendError, FluxError
 from mitsuba_fspt.tissue import phantom_file
 from mitsuba_fspt.tissue.composition import Absorbers
@@ -195,6 +196,28 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
         read_tetrahedra(tmp_path / "tissue.vtu", 2, labels="organ")
     with pytest.raises(FluxError, match="'length_unit' must be one of mm, cm, m, got 'inch'"):
         read_tetrahedra(tmp_path / "tissue.vtu", 2, "inch")
+
+
+def test_the_unit_of_a_mesh_is_checked(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A body of 18.8 mm in a file in cm, without its unit. Seen to fail: its exit power was that of 1.6 mm, 0.95 in
+    place of 0.19 W of a larger one, without a word; of a name with the unit, too.
+    """
+    mesh = cylinder_tetrahedra(6, 8, 4)
+    for name in ("vertices", "vertices_cm"):
+        np.savez(tmp_path / f"{name}.npz", **{name: 0.1 * mesh.vertices}, tetrahedra=mesh.cells)
+    found = read_tetrahedra(tmp_path / "vertices.npz", 4)
+    assert np.ptp(found.vertices[:, 2]) == pytest.approx(0.8)
+    assert 'and 18.8 mm if it is cm. If that is right give length_unit = "cm".' in caplog.messages[0]
+    with pytest.raises(FluxError, match=r"geometry: vertices_cm.npz: its vertices are in 'cm' by the file"):
+        read_tetrahedra(tmp_path / "vertices_cm.npz", 4)
+    caplog.clear()
+    assert np.ptp(read_tetrahedra(tmp_path / "vertices_cm.npz", 4, "cm").vertices[:, 2]) == pytest.approx(8)
+    assert not caplog.messages
+    surface = trimesh.Trimesh(mesh.vertices / 1e3, boundary(mesh.vertices, mesh.cells)[0])
+    surface.export(tmp_path / "body.glb")
+    with pytest.raises(FluxError, match="it has no labels 'organ'"):
+        read_tetrahedra(tmp_path / "body.glb", 4, labels="organ")
+    assert not caplog.messages  # metres, by the standard
 
 
 def test_the_border_of_tetrahedra_from_a_file_is_smooth(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from .mmc import mmc_mesh, read_mmc
 from .nirfast import nirfast_mesh, read_nirfast
 from .ply import read_ply
 from .raw import Field, RawMesh, SurfaceValues, surface_values
+from .stated_units import LENGTH_UNIT
 from .surface_files import read_arrays, read_obj, read_off, read_trimesh
-from .table import column, read_values
+from .table import column, labelled_values
 
 MeshLike = str | os.PathLike[str] | tuple[NDArray, NDArray]
 ValuesLike = str | os.PathLike[str] | NDArray
@@ -110,8 +111,10 @@ def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field
 def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
     """Mesh with `values` in place of its own fields."""
     if isinstance(values, (str, os.PathLike)):
-        name, array = Path(values).name, read_values(Path(values), field)
+        places = raw.points, raw.points[raw.cells].mean(axis=1)
+        name, (array, label) = Path(values).name, labelled_values(Path(values), field, places)
     else:
-        name, array = "values", column(np.asarray(values), [], field, "values")
+        name, array, label = "values", column(np.asarray(values), [], field, "values"), ""
     source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
-    return replace(raw, source=source, fields=(Field(name, array, None),))
+    stated = {key: text for key, text in raw.stated.items() if key == LENGTH_UNIT}
+    return replace(raw, source=source, fields=(Field(name, array, None, label=label),), stated=stated)

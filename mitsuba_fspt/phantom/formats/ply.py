@@ -15,6 +15,7 @@ from ...runtime.errors import FluxError
 from ...runtime.ply_file import require_ply, require_whole
 from ..surface_mesh import Indices, Points
 from .raw import Field, RawMesh, scalars
+from .stated_units import LENGTH_UNIT, LENGTHS, QUANTITY, VALUE_UNIT
 from .surface_files import load_triangles
 
 # Properties of geometry and colour.
@@ -51,7 +52,11 @@ def read_ply(path: Path) -> tuple[RawMesh, dict[str, str]]:
         fitting = len(mesh.vertices if on == "vertex" else mesh.faces)
         fields += [Field(name, v, on, name in TEXTURE) for name, v in values.items() if len(v) == fitting]
     points, cells = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    return RawMesh(points, cells, path.name, scalars(fields)), _comments(path)
+    comments = _comments(path)
+    stated = {key: comments[key] for key in (VALUE_UNIT, QUANTITY) if key in comments}
+    if (length := comments.get(LENGTH_UNIT)) in LENGTHS:
+        stated[LENGTH_UNIT] = str(length)
+    return RawMesh(points, cells, path.name, scalars(fields), stated=stated), comments
 
 
 def attribute_name(name: str) -> str:

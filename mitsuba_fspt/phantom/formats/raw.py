@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,15 @@ LABELS = "medit:"  # prefix of the part numbers of a mesh, which label media and
 class Field:
     """Named values of shape (N,), one `on` each 'vertex', 'cell' (triangle or tetrahedron) or boundary 'face'.
 
-    If `on` is None, the number of values decides. With `by_name` the field is chosen by its name only.
+    If `on` is None, the number of values decides. With `by_name` the field is chosen by its name only. `label` is what
+    a table calls them, which may state their unit.
     """
 
     name: str
     values: NDArray
     on: str | None
     by_name: bool = False
+    label: str = ""
 
 
 def scalars(fields: Iterable[Field]) -> tuple[Field, ...]:
@@ -46,6 +48,7 @@ class RawMesh:
     point_order : False if the file defines no order of the vertices (STL), so that values cannot refer to it
     index : refractive index at the points (V,), NaN if the parameter file does not contain it; None without such a file
     triangles : of a file of tetrahedra that lists triangles, too (F, 3), in its order; else None
+    stated : texts of the file on 'length_unit', 'unit' and 'quantity' of its values, as far as it has them
     """
 
     points: Points
@@ -56,6 +59,7 @@ class RawMesh:
     point_order: bool = True
     index: NDArray[np.float64] | None = None
     triangles: Indices | None = None
+    stated: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         points, cells = self.points, self.cells
@@ -84,6 +88,7 @@ class SurfaceValues:
     """Values on a triangle surface, per 'vertex' (V,) or per 'face' (F,), in the file's units.
 
     index : refractive index at its vertices (V,), as in `RawMesh`
+    label : what the file calls the values: the name of their field, and that of a table's column
     """
 
     vertices: Points
@@ -92,6 +97,7 @@ class SurfaceValues:
     per: str
     name: str
     index: NDArray[np.float64] | None
+    label: str = ""
 
 
 def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceValues:
@@ -123,7 +129,8 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
         values = chosen.values if on == "face" else chosen.values[owner]
     per = "vertex" if on == "vertex" else "face"
     index = None if mesh.index is None else mesh.index[kept]
-    return SurfaceValues(vertices, faces, values.astype(np.float64), per, chosen.name, index)
+    label = f"{chosen.name} {chosen.label}".strip()
+    return SurfaceValues(vertices, faces, values.astype(np.float64), per, chosen.name, index, label)
 
 
 def _require_same_order(triangles: Indices, faces: Indices, name: str) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...runtime.errors import BackendError, FluxError, one_line
 from ..surface_mesh import merge
 from .raw import Field, RawMesh, scalars
+from .stated_units import LENGTH_UNIT, length_of_name
 from .table import read_npz, require_file
 
 if TYPE_CHECKING:
@@ -25,26 +26,28 @@ KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm
 def read_arrays(path: Path) -> RawMesh:
     """Mesh of a `.npz` with `vertices` (V, 3), `faces` (F, 3) or `tetrahedra` (T, 4) from 0, and fields of any name.
 
-    `nodes` counts as `vertices`, and the names may have a suffix, as in `vertices_mm`.
+    `nodes` counts as `vertices`, and the names may have a suffix, as in `vertices_mm`, which states the unit.
     """
     arrays = read_npz(path)
-    points = _named(arrays, ("vertices", "nodes"), path)
-    cells = _named(arrays, ("faces", "tetrahedra"), path)
+    name = _named(arrays, ("vertices", "nodes"), path)
+    points, cells = arrays[name], arrays[_named(arrays, ("faces", "tetrahedra"), path)]
     fields = tuple(
         Field(name, values, None)
         for name, values in arrays.items()
         if values.dtype.kind in "fiu" and values.shape in (points.shape[:1], cells.shape[:1])
     )
-    return RawMesh(points.astype(np.float64), cells, path.name, fields)
+    length = length_of_name(name)
+    stated = {} if length is None else {LENGTH_UNIT: length}
+    return RawMesh(points.astype(np.float64), cells, path.name, fields, stated=stated)
 
 
-def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> NDArray:
-    """The one array of two axes whose name is one of `words`, or starts with one and an underscore."""
+def _named(arrays: dict[str, NDArray], words: tuple[str, ...], path: Path) -> str:
+    """Name of the one array of two axes whose name is one of `words`, or starts with one and an underscore."""
     fitting = [n for n, a in arrays.items() if a.ndim == 2 and any(n == w or n.startswith(f"{w}_") for w in words)]
     if len(fitting) != 1:
         listed = ", ".join(f"'{name}' {array.shape}" for name, array in arrays.items())
         raise FluxError(f"'{path}' must have one array named {' or '.join(words)}, of two axes. It has {listed}.")
-    return arrays[fitting[0]]
+    return fitting[0]
 
 
 def read_obj(path: Path) -> RawMesh:

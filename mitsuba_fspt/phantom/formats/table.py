@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from io import StringIO
 from pathlib import Path
 
@@ -16,21 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import BackendError, FluxError, one_line
+from .row_order import require_order
 
 # Longest time to read a MATLAB file, and least speed; an idle machine takes 0.5 s and reads 100 MB/s.
 MAT_TIME, MAT_SPEED = 30.0, 1e6  # s, bytes/s
 
 
 def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
-    """Values of a file in its order, shape (N,).
+    """Values of a file in its order, shape (N,), as of `labelled_values`."""
+    return labelled_values(path, field)[0]
+
+
+def labelled_values(
+    path: Path, field: str | None = None, places: Sequence[NDArray[np.float64]] = ()
+) -> tuple[NDArray[np.float64], str]:
+    """Values of a file in its order, shape (N,), and what it calls them: the name of their array or column.
 
     `field` chooses one of several: a column by its name in the header line or by its number from 1, an array of an
     `.npz` or a variable of a `.mat` by its name. Text may have comments (#), a header line, and commas, semicolons,
     tabs or spaces between its columns; numbers between semicolons may have a decimal comma.
 
+    places : positions (n, 3) of the elements that the values may belong to, in their order
+
     Raises
     ------
-    FluxError : the file cannot be read, or holds several columns or arrays and `field` names none of them.
+    FluxError : the file cannot be read, or holds several columns or arrays and `field` names none of them; its columns
+        tell of another order.
     BackendError : a `.mat` file without SciPy.
     """
     suffix = path.suffix.lower()
@@ -38,36 +49,25 @@ def read_values(path: Path, field: str | None = None) -> NDArray[np.float64]:
         array = _load_numpy(path)
         if not isinstance(array, np.ndarray):
             raise FluxError(f"'{path}' holds several arrays. Name such a file .npz.")
-        return column(array, [], field, str(path))
+        return column(array, [], field, str(path)), ""
     if suffix in (".npz", ".mat"):
         arrays = read_npz(path) if suffix == ".npz" else _read_mat(path)
         numbers = {name: array for name, array in arrays.items() if array.dtype.kind in "fiuc"}
         name, _, number = (field or "").partition(":")  # `phi:2` is column 2 of phi
         name = pick(numbers, name or None, str(path))
-        return column(numbers[name], [], number or None, f"{path} '{name}'")
-    table, names = read_table(path)
-    _require_order(table, names, field, str(path))
-    return column(table, names, field, str(path))
+        return column(numbers[name], [], number or None, f"{path} '{name}'"), name
+    table, names, header = _parsed(path)
+    values = column(table, names, field, str(path))
+    require_order(table, names, field, places, str(path))
+    return values, _label(names, header, field)
 
 
-def _require_order(table: NDArray[np.float64], names: list[str], field: str | None, where: str) -> None:
-    """Raise FluxError for a column that numbers the rows, from 0 or 1, in another order than that of the file.
-
-    Not if another column numbers them in this order; the column that `field` chooses holds values and no numbers.
-    """
-    count, shuffled = np.arange(len(table)), []
-    for number, numbers in enumerate(table.T if table.shape[1] > 1 else (), start=1):
-        chosen = field is not None and field in (str(number), *names[number - 1 : number])
-        if chosen or numbers.min() not in (0, 1) or not np.array_equal(np.sort(numbers) - numbers.min(), count):
-            continue
-        if (np.diff(numbers) > 0).all():
-            return
-        shuffled.append(number)
-    if shuffled:
-        raise FluxError(
-            f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
-            "order of the rows. Sort them by it."
-        )
+def _label(names: list[str], header: str, field: str | None) -> str:
+    """Name of the column that `field` chooses of several; the whole header where that is open."""
+    if field in names:
+        return str(field)
+    number = int(field) if field is not None and re.fullmatch(r"\d+", field) else 1
+    return names[number - 1] if 1 <= number <= len(names) else header
 
 
 def pick(candidates: dict[str, NDArray], field: str | None, where: str) -> str:
@@ -135,15 +135,22 @@ def read_table(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], li
     ------
     FluxError : the file is missing, empty, binary, or a line does not fit; the message names the line.
     """
+    table, names, _ = _parsed(path, skip_lines)
+    return table, names
+
+
+def _parsed(path: Path, skip_lines: int = 0) -> tuple[NDArray[np.float64], list[str], str]:
+    """Numbers and names as of `read_table`, and the whole header line, '' without one."""
     text = _text(path)
-    names, delimiter, skip = _layout(text, skip_lines)
+    header, delimiter, skip = _layout(text, skip_lines)
     if skip is None:
         raise FluxError(f"'{path}' holds no values. Give one number a line.")
     try:
         table = np.loadtxt(StringIO(_with_points(text, delimiter)), delimiter=delimiter, skiprows=skip, ndmin=2)
     except ValueError as cause:
         raise FluxError(f"'{path}' is not a table of numbers: {one_line(cause)}. Fix that line.") from cause
-    return table, names if len(names) == table.shape[1] else []
+    names = [name.strip(' "') for name in header.split(delimiter)] if header else []
+    return table, names if len(names) == table.shape[1] else [], header
 
 
 def _text(path: Path) -> str:
@@ -159,8 +166,8 @@ def _text(path: Path) -> str:
     return text
 
 
-def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | None]:
-    """Column names ([] without header), delimiter (None: blanks), number of lines before the numbers (None: none).
+def _layout(text: str, skip_lines: int) -> tuple[str, str | None, int | None]:
+    """Header line ('' without one), delimiter (None: blanks), number of lines before the numbers (None: none).
 
     `skip_lines` : number of lines at the top to ignore
     """
@@ -173,10 +180,8 @@ def _layout(text: str, skip_lines: int) -> tuple[list[str], str | None, int | No
             header = line
             continue
         delimiter = next((mark for mark in ";,\t" if mark in line), None)
-        header = header.lstrip("# ").rstrip(";")
-        names = [name.strip(' "') for name in header.split(delimiter)] if header else []
-        return names, delimiter, number
-    return [], None, None
+        return header.lstrip("# ").rstrip(";"), delimiter, number
+    return "", None, None
 
 
 def _with_points(text: str, delimiter: str | None) -> str:

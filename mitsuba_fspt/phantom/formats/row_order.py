@@ -1,0 +1,76 @@
+"""Order of the rows of a table with values, which is the mesh's: columns that number the rows, or hold their places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...runtime.errors import FluxError
+
+Table = NDArray[np.float64]
+# Names of columns that number the rows: id, node, vertex, ...
+NUMBER = re.compile(r"(^|[^a-z])(#|id|gid|nr|num|index|label|tag|node|vert|point|face|elem)", re.IGNORECASE)
+AT = 1e-3  # of the mesh's diagonal: distance within which the position of a row is that of a vertex
+
+
+def require_order(table: Table, names: list[str], field: str | None, places: Sequence[Table], where: str) -> None:
+    """Raise FluxError for a table whose columns say that its rows are in another order than the mesh's elements.
+
+    field : chosen column, which holds values, by its name in `names` or its number from 1
+    places : positions (n, 3) of elements that the rows may stand for, in their order
+    """
+    chosen = [field in (str(k + 1), *names[k : k + 1]) if field is not None else False for k in range(table.shape[1])]
+    _require_numbers(table, names, chosen, where)
+    for first in _triples(chosen):
+        at = table[:, first : first + 3]
+        if any(_are_shuffled(at, place) for place in places if len(place) == len(at)):
+            raise FluxError(
+                f"{where}: columns {first + 1} to {first + 3} are positions of the mesh's elements in another order, "
+                "and values are taken in the order of the rows. Sort the rows as the mesh."
+            )
+
+
+def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: str) -> None:
+    """Raise FluxError for a column that numbers the rows in another order, unless another one numbers them in theirs.
+
+    Numbers count from 0 or 1; those of a first column with such a name or none may be any, as of a larger mesh.
+    """
+    count, shuffled = np.arange(len(table)), []
+    for column, numbers in enumerate(table.T if table.shape[1] > 1 else ()):
+        whole = bool((numbers == np.floor(numbers)).all()) and numbers.min() >= 0
+        if chosen[column] or not whole or len(np.unique(numbers)) < len(numbers):
+            continue
+        numbered = column == 0 and (not names or NUMBER.search(names[0]))
+        if not numbered and not np.array_equal(np.sort(numbers) - min(numbers.min(), 1), count):
+            continue
+        if (np.diff(numbers) > 0).all():
+            return
+        shuffled.append(column + 1)
+    if shuffled:
+        raise FluxError(
+            f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
+            "order of the rows. Sort them by it."
+        )
+
+
+def _triples(chosen: list[bool]) -> Iterator[int]:
+    """First of each three columns beside each other that hold no chosen values."""
+    yield from (k for k in range(len(chosen) - 3 + 1) if len(chosen) > 3 and not any(chosen[k : k + 3]))
+
+
+def _are_shuffled(at: Table, place: Table) -> bool:
+    """True if the rows of `at` are positions of `place`, in any unit, but not in its order."""
+    from scipy.spatial import cKDTree
+
+    if not (np.isfinite(at).all() and np.isfinite(place).all()):
+        return False
+    size, own = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (place, at))
+    if not (size > 0 and own > 0):
+        return False
+    at = at * (size / own)
+    if np.abs(at - place).max() <= AT * size:
+        return False
+    return bool(cKDTree(place).query(at)[0].max() <= AT * size)
