@@ -14,8 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..images.formats import read_planes
-from ..images.frame_file import FIRST, FITS, LAST, SAME_PITCH, TIFF, read_frame, shown_sides, tell_open_rows
-from ..images.tiff_pages import channels_of, read_tiff
+from ..images.frame_file import (
+    FIRST,
+    FITS,
+    LAST,
+    SAME_PITCH,
+    TIFF,
+    TURNED,
+    UNTAGGED,
+    read_frame,
+    shown_sides,
+    tell_open_rows,
+    tiff_row,
+)
+from ..images.tiff_pages import channels_of, read_oriented
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import whole
 
@@ -29,6 +41,15 @@ DN = ("", "dn", "adu", "count", "counts", "ct")  # names of it in BUNIT
 WRAPPED = -(2**14)  # DN of 16 bits with a sign: lower ones are no dark counts, but wrapped ones of 32768 … 49151
 EMPTY = -(2**15)  # least number of 16 bits with a sign, by which programs mark pixels without a value
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
+# Of a file's `top_row`: the keyword or tag, and words on files without it, and on those whose rows were turned by it.
+SILENT: dict[str | None, tuple[str, str]] = {
+    None: ("ROWORDER", "has no ROWORDER"),
+    UNTAGGED: ("Orientation", "has no Orientation"),
+}
+TURNS: dict[str | None, tuple[str, str]] = {
+    LAST: ("ROWORDER", "is BOTTOM-UP"),
+    TURNED: ("Orientation", "was turned by its Orientation"),
+}
 CLICK, BIAS, BACKGROUND, INFO = "luminescent", "readbiasonly", "background", "clickinfo"
 # Keys of ClickInfo.txt, the most specific first. A photograph and a bias frame have exposure times of their own.
 EXPOSURE = tuple(
@@ -56,7 +77,7 @@ class Counts:
     binning : side of the square of pixels read out as one, None if the file does not state it
     pixel_pitch : of the pixels read out [mm], None if the file does not state it
     pixel_sides : their width and height [mm], if the file states that they are not square; else None
-    top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
+    top_row : of the file, as of `read_frame`; None if it is a FITS file that does not state it
     unit : of the values by the file, None if it does not state it
     info : `Key: value` lines of a click folder, those of the luminescent image first
     """
@@ -156,12 +177,13 @@ def require_same_rows(name: str, top_row: str | None, other: str, others: str | 
 
     name, other : what they are, such as 'bias' and 'counts';  top_row, others : their `top_row`
     """
-    if {top_row, others} == {LAST, None}:
-        silent, turned = (name, other) if top_row is None else (other, name)
-        raise DetectorError(
-            f"reduce: '{silent}' has no ROWORDER, '{turned}' is BOTTOM-UP. Their rows would not match: set ROWORDER in "
-            "both FITS files."
-        )
+    pairs = {name: top_row, other: others}
+    silent = next((one for one, row in pairs.items() if row in SILENT), None)
+    turned = next((one for one, row in pairs.items() if row in TURNS), None)
+    if silent and turned and (pairs[silent], pairs[turned]) != (UNTAGGED, LAST):  # which a line says to turn
+        (tag, without), (own, stated) = SILENT[pairs[silent]], TURNS[pairs[turned]]
+        fix = f"set {tag} in both files" if tag == own else "state the top row in both files"
+        raise DetectorError(f"reduce: '{silent}' {without}, '{turned}' {stated}. Their rows would not match: {fix}.")
 
 
 def require_same_time(name: str, frame: Counts, other: str, time: float | None) -> None:
@@ -315,8 +337,11 @@ def _click(folder: Path) -> Counts:
     files = {file.stem.lower(): file for file in sorted(folder.iterdir()) if file.is_file()}
     if CLICK not in files:
         raise ImageError(f"folder '{folder}' holds no luminescent.TIF. Give a click folder of an IVIS camera.")
-    found = {n: _click_counts(files[n]).values for n in (BIAS, BACKGROUND) if n in files}
+    frames = {name: _click_counts(files[name]) for name in (BIAS, BACKGROUND) if name in files}
     light = _click_counts(files[CLICK])
+    for name, frame in frames.items():
+        require_same_rows(name, frame.top_row, CLICK, light.top_row)
+    found = {name: frame.values for name, frame in frames.items()}
     info = _click_info(files[INFO].read_text("utf-8", "replace")) if INFO in files else {}
     time, binning = _number(info, EXPOSURE), _number(info, BINNING)
     if binning is not None and not (binning >= 1 and binning == int(binning)):
@@ -332,7 +357,8 @@ def _click(folder: Path) -> Counts:
 
 def _click_counts(file: Path) -> Counts:
     """Counts of a TIFF of a click folder."""
-    return counts_of(read_tiff(file, f"counts '{file}'"), str(file))
+    images, orientation = read_oriented(file, f"counts '{file}'")
+    return replace(counts_of(images, str(file)), top_row=tiff_row(orientation))
 
 
 def _click_info(text: str) -> dict[str, str]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..runtime.errors import LONGEST_TEXT, BackendError, ImageError, one_line
 from .formats.fits import BOTTOM_UP, ROW_ORDER, TOP_DOWN
-from .tiff_pages import read_tiff, tell_left_out
+from .tiff_pages import read_oriented, tell_left_out
 
 LOG = logging.getLogger("mitsuba_fspt")
 TIFF, FITS = (".tif", ".tiff"), (".fits", ".fit", ".fts")
@@ -28,7 +28,7 @@ NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
 }
 KEYWORDS = (*NUMBERS, ROW_ORDER, UNIT)
 SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
-FIRST, LAST = "first", "last"  # which row of a file is the top one
+FIRST, LAST, TURNED, UNTAGGED = "first", "last", "turned", "untagged"  # which row of a file is the top one
 
 
 def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
@@ -36,7 +36,7 @@ def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
 
     The header's entries are `exposure_time` [s], `binning`, `pixel_pitch` [mm], or of pixels that are not square
     `pixel_sides`, width and height [mm], and `unit` of the values, as far as it has them, and `top_row`, the row of the
-    file that is the top one: 'first' or 'last', None if the header does not say it.
+    file that is the top one: 'first' or 'last', None if the header does not say it. Of a TIFF it is as of `tiff_row`.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -47,7 +47,8 @@ def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """
     suffix = path.suffix.lower()
     if suffix in TIFF:
-        return read_tiff(path, thing), {}
+        images, orientation = read_oriented(path, thing)
+        return images, {"top_row": tiff_row(orientation)}
     if suffix in FITS:
         return _fits(path, thing)
     if suffix != ".npy":
@@ -147,6 +148,13 @@ def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
     if wide and high and abs(wide - high) > SAME_PITCH * high:
         return found | {"pixel_sides": (wide / UM_PER_MM, high / UM_PER_MM)}
     return found | ({} if pitch is None else {"pixel_pitch": pitch / UM_PER_MM})
+
+
+def tiff_row(orientation: int | None) -> str:
+    """`top_row` of a TIFF: 'first' of Orientation 1, 'turned' of others, 'untagged', taken for the first, of none."""
+    if orientation is None:
+        return UNTAGGED
+    return FIRST if orientation == 1 else TURNED
 
 
 def shown_sides(sides: tuple[float, float]) -> str:

@@ -29,7 +29,12 @@ CHANNELS = "CS"  # axes of tifffile: colours, and samples of a pixel
 
 
 def read_tiff(path: Path, thing: str) -> NDArray[Any]:
-    """Images of a TIFF file, (h, w) or (pages, h, w, …), row 0 at the top.
+    """Images of a TIFF file, (h, w) or (pages, h, w, …), row 0 at the top, as of `read_oriented`."""
+    return read_oriented(path, thing)[0]
+
+
+def read_oriented(path: Path, thing: str) -> tuple[NDArray[Any], int | None]:
+    """Images of a TIFF file, (h, w) or (pages, h, w, …), row 0 at the top, and its Orientation; None without one.
 
     Values are as they are stored. Where the file's Orientation says that another row is the top one, the images are
     turned, which one line on stderr says. Of several series of pages the first is read, and of what tifffile reports
@@ -51,6 +56,7 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
                 raise ValueError("its pages follow each other in a circle")
             series, count = file.series[0], len(file.series)
             images, turned = _upright(series)
+            tagged = ORIENTATION in series.keyframe.tags
             inverted = series.keyframe.photometric == tifffile.PHOTOMETRIC.MINISWHITE
             missing = sum(page is None for page in series.pages)
     except Exception as cause:  # whatever a damaged file makes tifffile raise
@@ -70,14 +76,19 @@ def read_tiff(path: Path, thing: str) -> NDArray[Any]:
         more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
         LOG.warning("fspt: %s: tifffile reports: %s%s. Check the image.", thing, one_line(texts[0], LONGEST_TEXT), more)
     if turned != 1:
-        LOG.warning("fspt: %s: its rows do not begin at the top left (Orientation %d); it is turned.", thing, turned)
+        LOG.warning(
+            "fspt: %s: its rows do not begin at the top left (Orientation %d); it is turned. Turn frames without such "
+            "a tag, such as arrays and .npy, likewise.",
+            thing,
+            turned,
+        )
     if count > 1:
         tell_left_out(thing, f"{count} series of pages")
     if inverted:
         LOG.warning(
             "fspt: %s: it says that 0 is white (PhotometricInterpretation 0); more is taken as more light.", thing
         )
-    return images
+    return images, turned if tagged else None
 
 
 def tell_left_out(thing: str, images: str) -> None:

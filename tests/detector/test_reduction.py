@@ -411,6 +411,31 @@ def test_frames_of_another_order_of_rows_than_the_counts_are_refused(tmp_path, n
         CCD.reduce(files["counts"], exposure_time=60, wavelength_nm=650, **{name: files["frame"]}, **kind)
 
 
+@pytest.mark.parametrize("turned", ["counts", "frame"])
+def test_tiff_frames_without_the_orientation_of_the_counts_are_refused(tmp_path, turned):
+    """Of counts and dark frame one is turned by its Orientation, the other has no such tag; 1 is a tag.
+
+    Seen to fail: the dark frame of other rows was subtracted, 400 DN too much in one row and too little in another.
+    """
+    tifffile = pytest.importorskip("tifffile")
+    dark = np.repeat(np.arange(500, 1000, 100, dtype=np.uint16)[:, None], 4, axis=1)
+
+    def file(name, values, orientation):
+        tags = [] if orientation is None else [(274, 3, 1, orientation, True)]
+        stored = values[::-1] if orientation == 4 else values
+        tifffile.imwrite(path := tmp_path / f"{name}.tif", stored, extratags=tags)
+        return path
+
+    def reduced(counts, frame):
+        return CCD.reduce(file("counts", dark + 50, counts), **SETTINGS, dark=file("dark", dark, frame))
+
+    pair = (4, None) if turned == "counts" else (None, 4)
+    with pytest.raises(DetectorError, match=r"has no Orientation, '.*' was turned by its Orientation.*in both files"):
+        reduced(*pair)
+    for good in ((4, 4), (None, None), (4, 1), (1, None)):
+        np.testing.assert_array_equal(np.ptp(reduced(*good).power), 0)
+
+
 @pytest.mark.parametrize("name", ["read_noise", "flat_dark", "second counts"])
 def test_maps_and_frames_of_frames_have_the_rows_of_their_counts(tmp_path, caplog, name):
     """A map of the detector, the dark of a flat, and a flat of counts that are no longer the first ones.
