@@ -129,13 +129,31 @@ def closure(points: Points, faces: Indices) -> Closure:
 
 def repeated(points: Points, faces: Indices) -> int:
     """Number of faces that repeat another one, with the same corners and the same outward side."""
+    keys = _keys(_bounding(points, faces))
+    return len(keys) - len(np.unique(keys))
+
+
+def require_joined(points: Points, faces: Indices, where: str) -> None:
+    """Raise FluxError, which begins with `where`, if border `faces` of tetrahedra lie on each other, face to face.
+
+    Parts that touch there have nodes of their own, so that no light would pass between them.
+    """
     faces = _bounding(points, faces)
+    if count := len(np.intersect1d(_keys(faces), _keys(faces[:, ::-1]))):
+        raise FluxError(
+            f"{where}: {count // 2} border faces of tetrahedra lie on others, where parts touch whose nodes are not "
+            "joined. Merge nodes at equal positions, for example by 'Coherence Mesh' in Gmsh."
+        )
+
+
+def _keys(faces: Indices) -> NDArray[np.uint64]:
+    """Pseudo-random number of 64 bits for each face, the same for the same corners in the same sense of rotation."""
     first = faces.argmin(axis=1)[:, None]
     corners = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.uint64)
     key = np.zeros(len(faces), np.uint64)
     for corner in corners.T:
         key = _mixed(key + corner + np.uint64(1))
-    return len(key) - len(np.unique(key))
+    return key
 
 
 def turned_share(points: Points, faces: Indices) -> float:

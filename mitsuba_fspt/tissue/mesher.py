@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..phantom.formats import read_mesh
 from ..phantom.formats.stated_units import LENGTH_UNIT, require_length_unit
 from ..phantom.length_unit import millimetres, own_unit, unit_warning
-from ..phantom.surface_mesh import boundary, closure
+from ..phantom.surface_mesh import boundary, closure, require_joined
 from ..runtime.errors import BackendError, FluxError
 from .smooth_surface import SmoothSurface
 from .tetrahedra import Tetrahedra, require_few
@@ -63,6 +63,7 @@ def read_tetrahedra(
                 f"geometry: '{path}' is a surface, it has no labels '{labels}' of tetrahedra. Leave them out."
             )
         return tetrahedralize(points, raw.cells, edge)
+    require_joined(points, boundary(points, raw.cells)[0], f"geometry: {raw.source}")
     if labels is None:
         return _with_smooth_border(Tetrahedra(points, raw.cells).without_unused())
     found = [f for f in raw.fields if f.name == labels and f.values.shape == (len(raw.cells),)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import FluxError
-from ..surface_mesh import Indices, Points, boundary, compact
+from ..surface_mesh import Indices, Points, boundary, compact, require_joined
 from .table import pick, quoted
 
 LABELS = "medit:"  # prefix of the part numbers of a mesh, which label media and are never values
@@ -111,6 +111,7 @@ def surface_values(mesh: RawMesh, name: str | None, per: str | None) -> SurfaceV
     """
     if mesh.cells.shape[1] == 4:
         faces, owner = boundary(mesh.points, mesh.cells)
+        require_joined(mesh.points, faces, mesh.source)
     else:
         faces, owner = mesh.cells, np.arange(len(mesh.cells))
     chosen = _choose(mesh, name, per)
