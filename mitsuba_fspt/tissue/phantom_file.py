@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Mapping
@@ -26,6 +27,8 @@ from .tetrahedra import Tetrahedra
 from .toml_table import Table
 
 ABSORBERS = ("blood", "water", "fat")  # keys of a band in place of mua; saturation goes with blood
+VOLUME = 0.1  # relative error of a region's volume in the mesh, above which it is told
+LOG = logging.getLogger("mitsuba_fspt")
 SCATTERING = ("scattering", "scattering_power")  # keys in place of musp
 
 
@@ -170,6 +173,8 @@ class PhantomFile:
     def mesh(self) -> Tetrahedra:
         """Tetrahedra with the number of their region: 1, 2, … for `regions`, where the last one counts, else 0.
 
+        A tetrahedron is in the region that has its middle. A line on stderr tells of a volume that is not the region's.
+
         Raises
         ------
         FluxError, BackendError : as in cylinder_tetrahedra and read_tetrahedra; or no tetrahedron is in a region.
@@ -183,6 +188,8 @@ class PhantomFile:
                     f"region {number}: no tetrahedron of the mesh is in it ({part.where}). Check place and "
                     f"size, or give a mesh edge below {self.edge:g} mm."
                 )
+            if not isinstance(part.where, int):
+                _tell_volume(number, float(mesh.volumes[inside].sum()), mesh.volume_in(part.where), self.edge)
             region[inside] = number
         return replace(mesh, region=region)
 
@@ -219,6 +226,16 @@ class PhantomFile:
         mesh = self.mesh()
         mesh.cuts(self.surface_edge)
         return mesh
+
+
+def _tell_volume(number: int, volume: float, exact: float, edge: float) -> None:
+    """Say in one line on stderr that the tetrahedra of a region have not its volume [mm³]; `edge` of the mesh [mm]."""
+    if abs(volume - exact) > VOLUME * exact:
+        LOG.warning(
+            "fspt: region %d: its tetrahedra have %.3g of its volume in the tissue, %.3g mm^3, and absorb as much "
+            "less or more. Give a mesh edge of %.2g mm.",
+            *(number, volume / exact, exact, edge / 2),
+        )
 
 
 def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:

@@ -18,6 +18,7 @@ from ..runtime.errors import FluxError
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+SPREAD, POINTS = 200_000, (8, 4000)  # points in all cells near a shape, least and most in each
 STARTS = 4  # start cells of the search for a point's cell
 MOST_STEPS = 200  # of the search from one start cell
 ROUND_OFF = 1e-9  # of a barycentric coordinate
@@ -117,6 +118,21 @@ class Tetrahedra:
     def inside(self, shape: Shape) -> NDArray[np.bool_]:
         """True for each cell whose centroid lies in the shape, shape (T,)."""
         return shape.contains(self.vertices[self.cells].mean(axis=1))
+
+    def volume_in(self, shape: Shape) -> float:
+        """Volume [mm³] of the part of a shape that lies in the mesh to some percent, from points in cells near it."""
+        border = shape.border()
+        reach = 0.1 * np.ptp(border, axis=0)  # points of the border need not be its outermost ones
+        corners = self.vertices[self.cells]
+        low, high = border.min(axis=0) - reach, border.max(axis=0) + reach
+        near = ((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)
+        if not near.any():
+            return 0.0
+        count = int(np.clip(SPREAD // np.count_nonzero(near), *POINTS))
+        weights = np.random.default_rng(0).dirichlet(np.ones(4), count)  # the same points in each cell
+        points = np.einsum("pk,ckx->cpx", weights, corners[near])
+        inside = shape.contains(points.reshape(-1, 3)).reshape(-1, count)
+        return float(inside.mean(axis=1) @ self.volumes[near])
 
     def locate(self, points: Array) -> tuple[Index, Array]:
         """Cell that contains each of `points` (N, 3) [mm], or a cell close to a point outside the mesh.

@@ -199,6 +199,27 @@ def test_tetrahedra_with_labels_from_a_file(tmp_path: Path) -> None:
         read_tetrahedra(tmp_path / "tissue.vtu", 2, "inch")
 
 
+@pytest.mark.parametrize(("radius", "ratio"), [(1.0, 1.38), (3.0, None)])
+def test_the_volume_of_a_region_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, radius: float, ratio: float | None
+) -> None:
+    """A sphere in edges of 2 mm, of whose volume the tetrahedra have 138 %: 0.294 in place of 0.328 W leave by it.
+
+    Seen to fail: without a word. The volume in the mesh is exact to 3 %, half of it for a sphere that sticks out.
+    """
+    region = f'[[regions]]\nshape = "sphere"\ncentre = [0.5, 0.3, 1.0]\nradius = {radius}\nmua = 1\nmusp = 1\n'
+    mesh = described(tmp_path, SMALL + region).mesh()
+    exact = 4 / 3 * math.pi * radius**3
+    assert mesh.volume_in(Sphere((0.5, 0.3, 1.0), radius)) == pytest.approx(exact, rel=0.03)
+    assert mesh.volume_in(Sphere((0.5, 0.3, 4.0), radius)) == pytest.approx(exact / 2, rel=0.03)
+    if ratio is None:
+        assert not caplog.messages
+        return
+    assert mesh.volumes[mesh.region == 1].sum() == pytest.approx(ratio * exact, rel=0.01)
+    found = float(caplog.messages[0].split("have ")[1].split(" of its volume")[0])
+    assert found == pytest.approx(ratio, rel=0.03)
+
+
 def test_parts_that_are_not_joined_are_refused(tmp_path: Path) -> None:
     """Halves of a cylinder with nodes of their own at z = 0. Seen to fail: no light passed between them, 0.56 in place
     of 0.39 W left, for which the edges were blamed; the import had the power of the faces inside as well, 0.74 in place
