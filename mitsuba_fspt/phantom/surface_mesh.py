@@ -42,7 +42,7 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
 
     Raises
     ------
-    FluxError : a face belongs to more than two tetrahedra.
+    FluxError : a face belongs to more than two tetrahedra, or each to one, as of quadrangles.
     """
     faces = tetrahedra[:, TETRAHEDRON_FACES].reshape(-1, 3)
     shared_by = _multiplicity(np.sort(faces, axis=1), len(points))
@@ -53,6 +53,11 @@ def boundary(points: Points, tetrahedra: Indices) -> tuple[Indices, Indices]:
             "1), a face has at most two. Remove duplicate elements."
         )
     on_boundary = np.flatnonzero(shared_by == 1)
+    if len(on_boundary) == len(faces) > 4:
+        raise FluxError(
+            f"tetrahedra: no two of the {len(tetrahedra)} share a face, as if their four corners were those of "
+            "quadrangles. Split quadrangles into two triangles each, or join the nodes of the tetrahedra."
+        )
     owner = on_boundary // 4
     faces = faces[on_boundary]
     opposite = points[tetrahedra[owner, TETRAHEDRON_OPPOSITE[on_boundary % 4]]]

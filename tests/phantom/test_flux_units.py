@@ -363,6 +363,16 @@ def test_meshes_in_another_unit_than_their_file_states(tmp_path):
     assert import_flux(tmp_path / "box.ply", np.ones(8), a=1.0).power == pytest.approx(26)
 
 
+def test_quadrangles_are_no_tetrahedra(tmp_path):
+    """Sides of a cube, of four corners each, as an array and named faces. Seen to fail: 1200 in place of 600 mm²."""
+    corners = 10.0 * np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, -1).T
+    sides = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    np.savez(tmp_path / "cube.npz", vertices=corners, faces=sides, jn=np.ones(8))
+    for given in (((corners, sides), np.ones(8)), ((corners, sides), np.ones(6)), (tmp_path / "cube.npz",)):
+        with pytest.raises(FluxError, match=r"no two of the 6 share a face.*Split quadrangles into two triangles"):
+            import_flux(*given)
+
+
 @pytest.mark.parametrize("apart", [False, True])
 def test_faces_that_are_there_twice_are_refused(apart):
     """With the same corners or with vertices of their own; a sheet may have a face on either side.
