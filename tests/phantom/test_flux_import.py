@@ -89,6 +89,14 @@ def test_trimesh_formats_with_values_beside(tmp_path, suffix, per):
     assert_law(phantom, SPHERE.area)
 
 
+def test_values_beside_several_meshes_without_an_order_are_refused(tmp_path):
+    """Two spheres of a GLB. Seen to fail: each had the values of the other one, without a word."""
+    both = trimesh.Scene([SPHERE, SPHERE.copy().apply_translation((0, 0, 50))])
+    both.export(tmp_path / "two.glb")
+    with pytest.raises(FluxError, match="it holds 2 meshes, whose order its format leaves open"):
+        import_flux(tmp_path / "two.glb", np.repeat([1.0, 2.0], len(VERTICES)))
+
+
 def test_a_glb_is_in_metres(tmp_path):
     """By glTF's standard; its values are W/m², so that the power is that of the same numbers in W/mm² and mm."""
     SPHERE.export(tmp_path / "mesh.glb")

@@ -109,7 +109,12 @@ def _from_arrays(mesh: tuple[NDArray, NDArray], values: ValuesLike | None, field
 
 
 def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh:
-    """Mesh with `values` in place of its own fields."""
+    """Mesh with `values` in place of its own fields; FluxError for a file of several meshes without an order."""
+    if raw.parts > 1:
+        raise FluxError(
+            f"{raw.source}: it holds {raw.parts} meshes, whose order its format leaves open, so that values of another "
+            "file fit nothing. Save them as one mesh, for example as PLY."
+        )
     if isinstance(values, (str, os.PathLike)):
         places = raw.points, raw.points[raw.cells].mean(axis=1)
         name, (array, label) = Path(values).name, labelled_values(Path(values), field, places)

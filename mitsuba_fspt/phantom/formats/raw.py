@@ -46,6 +46,7 @@ class RawMesh:
     quantity : of the values: 'exitance' or 'fluence' [W per square of the file's length unit], or 'power' [W] of each
         face
     point_order : False if the file defines no order of the vertices (STL), so that values cannot refer to it
+    parts : number of meshes in a file that leaves their order open (GLB, …), to which values of no other file refer
     index : refractive index at the points (V,), NaN if the parameter file does not contain it; None without such a file
     triangles : of a file of tetrahedra that lists triangles, too (F, 3), in its order; else None
     stated : texts of the file on 'length_unit', 'unit' and 'quantity' of its values, as far as it has them
@@ -57,6 +58,7 @@ class RawMesh:
     fields: tuple[Field, ...] = ()
     quantity: str = "exitance"
     point_order: bool = True
+    parts: int = 1
     index: NDArray[np.float64] | None = None
     triangles: Indices | None = None
     stated: Mapping[str, str] = field(default_factory=dict)

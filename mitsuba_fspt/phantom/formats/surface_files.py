@@ -19,6 +19,7 @@ from .table import read_npz, require_file
 if TYPE_CHECKING:
     import trimesh
 
+PARTS = "fspt_parts"  # key of trimesh's metadata
 # Formats that trimesh reads itself; it would pass any other on to meshio.
 KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
 
@@ -123,11 +124,11 @@ def read_trimesh(path: Path) -> RawMesh:
     if kind == "stl":
         points, cells = merge(points, cells)
         return RawMesh(points, cells, path.name, point_order=False)
-    return RawMesh(points, cells, path.name, _fields(loaded))
+    return RawMesh(points, cells, path.name, _fields(loaded), parts=loaded.metadata[PARTS])
 
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
-    """trimesh's mesh of a file, its vertices and faces unprocessed.
+    """trimesh's mesh of a file, its vertices and faces unprocessed; `PARTS` of its metadata: meshes it is joined from.
 
     Raises
     ------
@@ -140,7 +141,9 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # NumPy's at a corner that is no number
-            mesh = trimesh.load_scene(path, process=False, **options).to_mesh()
+            scene = trimesh.load_scene(path, process=False, **options)
+            mesh = scene.to_mesh()
+            mesh.metadata[PARTS] = len(scene.graph.nodes_geometry)
         count = len(mesh.faces)
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
