@@ -378,6 +378,16 @@ def test_rows_with_numbers_of_a_larger_mesh(tmp_path, header, refused):
 
 
 @pytest.mark.parametrize("first", [0, 1])
+def test_numbers_of_the_rows_are_no_values(tmp_path, first):
+    """Column 1 of node, jn by its number. Seen to fail: a power of 0, 1, 2, … W/mm² without a word."""
+    ball = trimesh.creation.icosphere(1, 10.0)
+    rows = [f"{first + k},1e-6" for k in range(len(ball.vertices))]
+    (tmp_path / "jn.csv").write_text("\n".join(["node,jn", *rows]))
+    with pytest.raises(FluxError, match="column 1 numbers the rows and holds no values"):
+        import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="1")
+
+
+@pytest.mark.parametrize("first", [0, 1])
 def test_rows_that_are_numbered_in_another_order_are_refused(tmp_path, first):
     """A table by nodes, sorted by something else: the values were taken in the order of the rows."""
     ball = trimesh.creation.icosphere(1, 10.0)

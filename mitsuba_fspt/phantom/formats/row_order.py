@@ -13,6 +13,7 @@ from ...runtime.errors import FluxError
 Table = NDArray[np.float64]
 # Names of columns that number the rows: id, node, vertex, ...
 NUMBER = re.compile(r"(^|[^a-z])(#|id|gid|nr|num|index|label|tag|node|vert|point|face|elem)", re.IGNORECASE)
+MANY = 10  # rows: of fewer, 1, 2, 3, … may be values
 AT = 1e-3  # of the mesh's diagonal: distance within which the position of a row is that of a vertex
 
 
@@ -38,13 +39,18 @@ def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: 
 
     Numbers count from 0 or 1; those of a first column with such a name or none may be any, as of a larger mesh.
     """
-    count, shuffled = np.arange(len(table)), []
+    shuffled = []
+    if chosen[0] and len(chosen) > 1 and len(table) >= MANY and _is_count(table[:, 0]):
+        raise FluxError(
+            f"{where}: column 1 numbers the rows and holds no values. Choose another one by --field; columns count "
+            "from 1."
+        )
     for column, numbers in enumerate(table.T if table.shape[1] > 1 else ()):
         whole = bool((numbers == np.floor(numbers)).all()) and numbers.min() >= 0
         if chosen[column] or not whole or len(np.unique(numbers)) < len(numbers):
             continue
         numbered = column == 0 and (not names or NUMBER.search(names[0]))
-        if not numbered and not np.array_equal(np.sort(numbers) - min(numbers.min(), 1), count):
+        if not numbered and not _is_count(np.sort(numbers)):
             continue
         if (np.diff(numbers) > 0).all():
             return
@@ -54,6 +60,11 @@ def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: 
             f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
             "order of the rows. Sort them by it."
         )
+
+
+def _is_count(numbers: Table) -> bool:
+    """True for 0, 1, 2, … and for 1, 2, 3, …"""
+    return bool(numbers[0] in (0, 1) and np.array_equal(numbers - numbers[0], np.arange(len(numbers))))
 
 
 def _triples(chosen: list[bool]) -> Iterator[int]:
