@@ -343,12 +343,12 @@ def test_nirfast(tmp_path, suffix):
 
 @pytest.mark.parametrize("places", ["vertices", "faces"])
 def test_rows_with_positions_in_another_order_are_refused(tmp_path, places):
-    """A table x, y, z [m], J_n of vertices or centroids of a mesh in mm. Seen to fail: J_n on other vertices without a
-    word, whose correlation with the right ones was -0.06.
+    """A table x, y, z [m], J_n of vertices or centroids of a mesh in mm, 5 mm away. Seen to fail: J_n on other vertices
+    without a word, whose correlation with the right ones was -0.06.
     """
     ball = trimesh.creation.icosphere(1, 10.0)
     at = ball.vertices if places == "vertices" else ball.triangles_center
-    table = np.column_stack([1e-3 * at, 2 + at[:, 2] / 10])
+    table = np.column_stack([1e-3 * (at + 5), 2 + at[:, 2] / 10])
     for order, good in ((slice(None), True), (slice(None, None, -1), False)):
         np.savetxt(tmp_path / "jn.csv", table[order], delimiter=",", header="x,y,z,jn", comments="")
         if good:

@@ -73,7 +73,7 @@ def _triples(chosen: list[bool]) -> Iterator[int]:
 
 
 def _are_shuffled(at: Table, place: Table) -> bool:
-    """True if the rows of `at` are positions of `place`, in any unit, but not in its order."""
+    """True if the rows of `at` are positions of `place`, in any unit and from any origin, but not in its order."""
     from scipy.spatial import cKDTree
 
     if not (np.isfinite(at).all() and np.isfinite(place).all()):
@@ -81,7 +81,7 @@ def _are_shuffled(at: Table, place: Table) -> bool:
     size, own = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (place, at))
     if not (size > 0 and own > 0):
         return False
-    at = at * (size / own)
-    if np.abs(at - place).max() <= AT * size:
+    at, place = (at - at.min(axis=0)) / own, (place - place.min(axis=0)) / size
+    if np.abs(at - place).max() <= AT:
         return False
-    return bool(cKDTree(place).query(at)[0].max() <= AT * size)
+    return bool(cKDTree(place).query(at)[0].max() <= AT)
