@@ -11,8 +11,8 @@ LENGTH_UNIT, VALUE_UNIT, QUANTITY = "length_unit", "unit", "quantity"  # keys of
 LENGTHS = (*MILLIMETRES, "nm", "um", "µm", "dm", "in", "inch")
 # Power per area, such as W/mm^2, mW/cm², W cm-2 or W_per_m2, and whether it is per solid angle as well.
 DENSITY = re.compile(
-    r"(?<![A-Za-z])(?P<prefix>[fpnuµmkM]?)W\s*(?:/|_per_|_|·|\*|\s)\s*(?P<length>[mcnuµd]?m)\s*"
-    r"(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²](?P<angle>[)}]?\s*(?:/|_per_|_|·|\*|\s)?\s*sr)?"
+    r"(?<![A-Za-z])(?P<prefix>[fpnuµmkM]?)W\s*(?:/|_per_|\s+per\s+|_|·|\*|\s)\s*[({]?\s*(?P<length>[mcnuµd]?m)\s*"
+    r"\$?(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²](?P<angle>[)}]?\s*(?:/|_per_|_|·|\*|\s)?\s*sr)?"
 )
 
 
