@@ -366,6 +366,20 @@ def test_meshes_in_another_unit_than_their_file_states(tmp_path):
     assert import_flux(tmp_path / "box.ply", np.ones(8), a=1.0).power == pytest.approx(26)
 
 
+@pytest.mark.parametrize(("units", "stated"), [("inch", "inch"), ("centimeter", "cm"), ("millimeters", None)])
+def test_the_unit_of_a_3mf_is_checked(tmp_path, monkeypatch, units, stated):
+    """As trimesh reads it with lxml. Seen to fail: inches were mm, without a word."""
+    mesh = trimesh.Trimesh(VERTICES, FACES, process=False, metadata={"fspt_parts": 1})
+    mesh.units = units
+    monkeypatch.setattr("mitsuba_fspt.phantom.formats.surface_files.load_triangles", lambda path, kind: mesh)
+    (tmp_path / "box.3mf").touch()
+    if stated is None:
+        assert import_flux(tmp_path / "box.3mf", np.ones(8)).area == pytest.approx(52)
+        return
+    with pytest.raises(FluxError, match=f"its vertices are in '{stated}' by the file"):
+        import_flux(tmp_path / "box.3mf", np.ones(8))
+
+
 def test_quadrangles_are_no_tetrahedra(tmp_path):
     """Sides of a cube, of four corners each, as an array and named faces. Seen to fail: 1200 in place of 600 mm²."""
     corners = 10.0 * np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, -1).T

@@ -25,7 +25,7 @@ def length_of_name(name: str) -> str | None:
 def require_length_unit(source: str, stated: str | None, unit: str) -> None:
     """Raise FluxError where a file states another unit of its vertices than the one that it is read in."""
     if stated is not None and stated != unit:
-        fix = f"Give --length-unit {stated}" if stated in MILLIMETRES else "Scale the mesh to mm, and name it so"
+        fix = f"Give --length-unit {stated}" if stated in MILLIMETRES else "Scale the mesh to mm"
         raise FluxError(f"{source}: its vertices are in '{stated}' by the file, they would be taken for {unit}. {fix}.")
 
 

@@ -19,6 +19,8 @@ from .table import read_npz, require_file
 if TYPE_CHECKING:
     import trimesh
 
+# Of its standard, and trimesh's for a file without one; others, such as inch, are refused.
+UNITS_OF_3MF = {"millimeter": "mm", "millimeters": "mm", "centimeter": "cm", "meter": "m"}
 PARTS = "fspt_parts"  # key of trimesh's metadata
 # Formats that trimesh reads itself; it would pass any other on to meshio.
 KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
@@ -124,7 +126,8 @@ def read_trimesh(path: Path) -> RawMesh:
     if kind == "stl":
         points, cells = merge(points, cells)
         return RawMesh(points, cells, path.name, point_order=False)
-    return RawMesh(points, cells, path.name, _fields(loaded), parts=loaded.metadata[PARTS])
+    stated = {LENGTH_UNIT: UNITS_OF_3MF.get(loaded.units, loaded.units)} if kind == "3mf" and loaded.units else {}
+    return RawMesh(points, cells, path.name, _fields(loaded), parts=loaded.metadata[PARTS], stated=stated)
 
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
