@@ -27,7 +27,7 @@ def invert(
     output: Annotated[Path, typer.Option("-o", "--output", help="Mesh with J_n to write, .ply or .vtu.")],
     samples: Annotated[int, typer.Option(help="Random draws for the intervals, 19 or more for 90 %; 0: none.")] = 0,
     seed: Annotated[int, typer.Option(help="Of the draws, not without 'samples'.")] = 0,
-    confidence: Annotated[float, typer.Option(help="Of the intervals.")] = 0.9,
+    confidence: Annotated[float, typer.Option(help="Of the intervals, not without 'samples'.")] = 0.9,
     weight: Annotated[float | None, typer.Option(help="Of the penalty on roughness [mm2]; found if left out.")] = None,
     gain_error: GainError = None,
     gain_per_view: GainPerView = 0.0,
