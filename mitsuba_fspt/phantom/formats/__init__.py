@@ -116,8 +116,9 @@ def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh
             "file fit nothing. Save them as one mesh, for example as PLY."
         )
     if isinstance(values, (str, os.PathLike)):
-        places = raw.points, raw.points[raw.cells].mean(axis=1)
-        name, (array, label) = Path(values).name, labelled_values(Path(values), field, places)
+        with np.errstate(over="ignore", invalid="ignore"):  # Phantom refuses vertices so far away
+            places = raw.points, raw.points[raw.cells].mean(axis=1)
+            name, (array, label) = Path(values).name, labelled_values(Path(values), field, places)
     else:
         name, array, label = "values", column(np.asarray(values), [], field, "values"), ""
     source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")

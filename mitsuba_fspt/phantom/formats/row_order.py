@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from ...runtime.errors import FluxError
 
 Table = NDArray[np.float64]
-# Names of columns that number the rows: id, node, vertex, ...
-NUMBER = re.compile(r"(^|[^a-z])(#|id|gid|nr|num|index|label|tag|node|vert|point|face|elem)", re.IGNORECASE)
+# Names of columns that number the rows: id, node, vertex, ..., but not num_photons
+NUMBER = re.compile(
+    r"(^|[^a-z])(index|label|tag|node|vert|point|face|elem|(#|g?id|nr|num(ber)?)[^a-z]*$)", re.IGNORECASE
+)
 MANY = 10  # rows: of fewer, 1, 2, 3, … may be values
 AT = 1e-3  # of the mesh's diagonal: distance within which the position of a row is that of a vertex
 
@@ -30,7 +32,8 @@ def require_order(table: Table, names: list[str], field: str | None, places: Seq
         if any(_are_shuffled(at, place) for place in places if len(place) == len(at)):
             raise FluxError(
                 f"{where}: columns {first + 1} to {first + 3} are positions of the mesh's elements in another order, "
-                "and values are taken in the order of the rows. Sort the rows as the mesh."
+                "and values are taken in the order of the rows. Sort the rows as the mesh, or remove these "
+                "columns if their axes are others."
             )
 
 
@@ -56,9 +59,10 @@ def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: 
             return
         shuffled.append(column + 1)
     if shuffled:
+        other = "" if names else ", or name it in a header if it holds something else"
         raise FluxError(
             f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
-            "order of the rows. Sort them by it."
+            f"order of the rows. Sort them by it{other}."
         )
 
 
@@ -79,7 +83,7 @@ def _are_shuffled(at: Table, place: Table) -> bool:
     if not (np.isfinite(at).all() and np.isfinite(place).all()):
         return False
     size, own = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (place, at))
-    if not (size > 0 and own > 0):
+    if not (0 < size < np.inf and 0 < own < np.inf):
         return False
     at, place = (at - at.min(axis=0)) / own, (place - place.min(axis=0)) / size
     if np.abs(at - place).max() <= AT:

@@ -146,7 +146,8 @@ def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
             warnings.simplefilter("error", RuntimeWarning)  # NumPy's at a corner that is no number
             scene = trimesh.load_scene(path, process=False, **options)
             mesh = scene.to_mesh()
-            mesh.metadata[PARTS] = len(scene.graph.nodes_geometry)
+            parts = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
+            mesh.metadata[PARTS] = sum(isinstance(part, trimesh.Trimesh) for part in parts)  # others: points, paths
         count = len(mesh.faces)
     except OSError as cause:
         raise FluxError(f"'{path}' cannot be read: {cause.strerror or one_line(cause)}. Check the name.") from cause
