@@ -26,6 +26,7 @@ from .smooth_surface import SmoothSurface
 from .tetrahedra import Tetrahedra, require_few
 
 LOG = logging.getLogger("mitsuba_fspt")
+OPTION = 'length_unit = "{}"'  # of the phantom file
 ENVELOPE = 20  # edge over the largest distance between mesher's border and surface; later the border is moved onto it
 ROUNDS = 5  # of moving vertices back whose move has flattened or inverted a cell
 CRUSHED = 0.3  # least ratio of a cell's signed volumes after and before the move
@@ -52,10 +53,10 @@ def read_tetrahedra(
     unit = own_unit(path) if length_unit is None else length_unit
     scale = millimetres(unit, "geometry")
     raw = read_mesh(path, None, None, "auto")
-    require_length_unit(f"geometry: {raw.source}", raw.stated.get(LENGTH_UNIT), unit)
+    require_length_unit(f"geometry: {raw.source}", raw.stated.get(LENGTH_UNIT), unit, OPTION)
     points = raw.points * scale
     diagonal = float(np.linalg.norm(np.ptp(points[raw.cells].reshape(-1, 3), axis=0)))
-    if warning := unit_warning(diagonal, unit, 'length_unit = "{}"'):
+    if warning := unit_warning(diagonal, unit, OPTION):
         LOG.warning("fspt: geometry: %s: %s", raw.source, warning)
     if raw.cells.shape[1] == 3:
         if labels is not None:

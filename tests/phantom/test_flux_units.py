@@ -323,17 +323,20 @@ def test_broken_mesh_files_give_one_line(tmp_path, suffix, content, capfd):
 
 STATED = [
     ("W/cm^2", "mm", "W/cm^2"),
-    ("mW/mm2", "mm", "mW/mm2"),
+    ("(mW/mm2)", "mm", "mW/mm2"),
     ("W_per_cm2", "mm", "W_per_cm2"),
-    ("W/(cm^2)", "mm", "W/(cm^2"),
+    ("W/(cm^2)", "mm", "W/(cm^2)"),
+    ("W.cm-2", "mm", "W.cm-2"),
+    ("\u03bcW/mm^2", "mm", "\u03bcW/mm^2"),
     ("W per cm2", "mm", "W per cm2"),
-    ("W/m$^2$", "mm", "W/m$^2"),
+    ("W/m$^2$", "mm", "W/m$^2$"),
     ("W m⁻²", "cm", "W m⁻²"),
     ("W/mm²/sr", "mm", "W/mm²/sr"),
     ("W/mm²", "mm", None),
     ("W·cm-2", "cm", None),
     ("W/mm^2 or W/cm^2", "mm", None),
     ("row/mm2", "mm", None),
+    ("5 W. mm 1 to 2", "cm", None),
 ]
 
 

@@ -11,8 +11,9 @@ LENGTH_UNIT, VALUE_UNIT, QUANTITY = "length_unit", "unit", "quantity"  # keys of
 LENGTHS = (*MILLIMETRES, "nm", "um", "µm", "dm", "in", "inch")
 # Power per area, such as W/mm^2, mW/cm², W cm-2 or W_per_m2, and whether it is per solid angle as well.
 DENSITY = re.compile(
-    r"(?<![A-Za-z])(?P<prefix>[fpnuµmkM]?)W\s*(?:/|_per_|\s+per\s+|_|·|\*|\s)\s*[({]?\s*(?P<length>[mcnuµd]?m)\s*"
-    r"\$?(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²](?P<angle>[)}]?\s*(?:/|_per_|_|·|\*|\s)?\s*sr)?"
+    r"(?<![A-Za-z])(?P<prefix>[fpnuµ\u03bcmkM]?)W\s*(?:/|_per_|\s+per\s+|_|·|\.|\*|\s)\s*(?P<open>[({])?\s*"
+    r"(?P<length>[mcnuµd]?m)\s*\$?(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²]"
+    r"(?P<angle>[)}]?\s*(?:/|_per_|_|·|\.|\*|\s)?\s*sr)?(?(open)[)}]?|\$?)"
 )
 
 
@@ -22,10 +23,13 @@ def length_of_name(name: str) -> str | None:
     return end if "_" in name and end in LENGTHS else None
 
 
-def require_length_unit(source: str, stated: str | None, unit: str) -> None:
-    """Raise FluxError where a file states another unit of its vertices than the one that it is read in."""
+def require_length_unit(source: str, stated: str | None, unit: str, option: str = "--length-unit {}") -> None:
+    """Raise FluxError where a file states another unit of its vertices than the one that it is read in.
+
+    option : by which the unit `{}` is given
+    """
     if stated is not None and stated != unit:
-        fix = f"Give --length-unit {stated}" if stated in MILLIMETRES else "Scale the mesh to mm"
+        fix = f"Give {option.format(stated)}" if stated in MILLIMETRES else "Scale the mesh to mm, and state so"
         raise FluxError(f"{source}: its vertices are in '{stated}' by the file, they would be taken for {unit}. {fix}.")
 
 
