@@ -26,7 +26,7 @@ class PixelMap:
     """Values (h, w) of a parameter on the pixels read out, row 0 at the top.
 
     path : absolute name of the file;  digest : first digits of its SHA-256
-    top_row : 'first' or 'last' row of the file; None if it is a FITS file that does not state it
+    top_row : of its file, as of `read_frame`; None if it is a FITS file that does not state it
     """
 
     path: str
