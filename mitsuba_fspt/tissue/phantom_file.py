@@ -232,9 +232,9 @@ def _tell_volume(number: int, volume: float, exact: float, edge: float) -> None:
     """Say in one line on stderr that the tetrahedra of a region have not its volume [mm³]; `edge` of the mesh [mm]."""
     if abs(volume - exact) > VOLUME * exact:
         LOG.warning(
-            "fspt: region %d: its tetrahedra have %.3g times the volume of its shape in the tissue, %.3g mm^3, and "
-            "absorb too much or too little. Give a mesh edge of %.2g mm, or a file of smaller tetrahedra.",
-            *(number, volume / exact, exact, edge / 2),
+            "fspt: region %d: its tetrahedra have %.3g mm^3, its shape in the tissue about %.3g mm^3: it absorbs too "
+            "much or too little. Give a mesh edge of %.2g mm, or a file of smaller tetrahedra.",
+            *(number, volume, exact, edge / 2),
         )
 
 

@@ -216,8 +216,17 @@ def test_the_volume_of_a_region_is_told(
         assert not caplog.messages
         return
     assert mesh.volumes[mesh.region == 1].sum() == pytest.approx(ratio * exact, rel=0.01)
-    found = float(caplog.messages[0].split("have ")[1].split(" times the volume")[0])
-    assert found == pytest.approx(ratio, rel=0.03)
+    found, stated = (float(text.split()[-1]) for text in caplog.messages[0].split(" mm^3")[:2])
+    assert found / stated == pytest.approx(ratio, rel=0.03)
+
+
+def test_a_region_much_smaller_than_a_tetrahedron(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A sphere of 0.01 mm about the middle of one. Seen to fail: a division by its volume, in which no point fell."""
+    mesh = described(tmp_path, SMALL).mesh()
+    centre = mesh.vertices[mesh.cells[0]].mean(axis=0).tolist()
+    region = f'[[regions]]\nshape = "sphere"\ncentre = {centre}\nradius = 0.01\nmua = 1\nmusp = 1\n'
+    assert np.count_nonzero(described(tmp_path, SMALL + region).mesh().region) == 1
+    assert "its shape in the tissue about 0 mm^3" in caplog.messages[0]
 
 
 def test_parts_that_are_not_joined_are_refused(tmp_path: Path) -> None:
