@@ -40,7 +40,10 @@ class OpticsSettings:
 
 @dataclass(frozen=True)
 class Coefficient:
-    """Coefficient of the tissue that images were fitted with: `value` and `sd`, in 1/mm for mua and musp."""
+    """Coefficient of the tissue that images were fitted with: `value` and `sd`, in 1/mm for mua and musp.
+
+    sd : with the errors of the equation itself (Eq. M.51), which may make it larger than the stated one
+    """
 
     value: float
     sd: float
