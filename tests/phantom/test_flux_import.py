@@ -365,6 +365,15 @@ def test_rows_with_positions_in_another_order_are_refused(tmp_path, places):
             import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="jn")
 
 
+def test_positions_outweigh_numbers_of_a_larger_mesh(tmp_path):
+    """Node numbers of a volume mesh in the order of its surface, beside the positions. Seen to fail: refused."""
+    ball = trimesh.creation.icosphere(1, 10.0)
+    numbers = 7 + 3 * np.arange(len(ball.vertices))[::-1]
+    table = np.column_stack([numbers, ball.vertices / 10, np.ones(len(numbers))])
+    np.savetxt(tmp_path / "jn.csv", table, delimiter=",", header="node,x,y,z,jn", comments="")
+    assert import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="jn").per == "vertex"
+
+
 def test_columns_that_are_no_positions_are_passed_over_at_once(monkeypatch):
     """Time gates: their sorted values are not those of the vertices, so that no nearest vertices are searched for.
 
@@ -390,8 +399,7 @@ def test_rows_with_numbers_of_a_larger_mesh(tmp_path, header, refused):
     if not refused:
         assert import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="2").power > 0
         return
-    fix = r"Sort them by it\.$" if header else "or name it in a header if it holds something else"
-    with pytest.raises(FluxError, match=f"column 1 numbers the rows, but not in ascending order.*{fix}"):
+    with pytest.raises(FluxError, match="column 1 numbers the rows, but not in ascending order"):
         import_flux((ball.vertices, ball.faces), tmp_path / "jn.csv", field="2")
 
 

@@ -22,19 +22,29 @@ AT = 1e-3  # of the mesh's diagonal: distance within which the position of a row
 def require_order(table: Table, names: list[str], field: str | None, places: Sequence[Table], where: str) -> None:
     """Raise FluxError for a table whose columns say that its rows are in another order than the mesh's elements.
 
+    Columns with positions in this order outweigh those with numbers.
+
     field : chosen column, which holds values, by its name in `names` or its number from 1
     places : positions (n, 3) of elements that the rows may stand for, in their order
     """
     chosen = [field in (str(k + 1), *names[k : k + 1]) if field is not None else False for k in range(table.shape[1])]
-    _require_numbers(table, names, chosen, where)
-    for first in _triples(chosen):
-        at = table[:, first : first + 3]
-        if any(_are_shuffled(at, place) for place in places if len(place) == len(at)):
+    if chosen[0] and len(chosen) > 1 and len(table) >= MANY and _is_count(table[:, 0]):
+        raise FluxError(
+            f"{where}: column 1 numbers the rows and holds no values. Choose another one by --field; columns count "
+            "from 1."
+        )
+    fitting = [place for place in places if len(place) == len(table)]
+    orders = [(k, _in_order(table[:, k : k + 3], place)) for k in _triples(chosen) for place in fitting]
+    if any(order for _, order in orders):
+        return
+    for first, order in orders:
+        if order is False:
             raise FluxError(
                 f"{where}: columns {first + 1} to {first + 3} are positions of the mesh's elements in another order, "
                 "and values are taken in the order of the rows. Sort the rows as the mesh, or remove these "
                 "columns if their axes are others."
             )
+    _require_numbers(table, names, chosen, where)
 
 
 def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: str) -> None:
@@ -43,11 +53,6 @@ def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: 
     Numbers count from 0 or 1; those of a first column with such a name or none may be any, as of a larger mesh.
     """
     shuffled = []
-    if chosen[0] and len(chosen) > 1 and len(table) >= MANY and _is_count(table[:, 0]):
-        raise FluxError(
-            f"{where}: column 1 numbers the rows and holds no values. Choose another one by --field; columns count "
-            "from 1."
-        )
     for column, numbers in enumerate(table.T if table.shape[1] > 1 else ()):
         whole = bool((numbers == np.floor(numbers)).all()) and numbers.min() >= 0
         if chosen[column] or not whole or len(np.unique(numbers)) < len(numbers):
@@ -59,10 +64,9 @@ def _require_numbers(table: Table, names: list[str], chosen: list[bool], where: 
             return
         shuffled.append(column + 1)
     if shuffled:
-        other = "" if names else ", or name it in a header if it holds something else"
         raise FluxError(
             f"{where}: column {shuffled[0]} numbers the rows, but not in ascending order, and values are taken in the "
-            f"order of the rows. Sort them by it{other}."
+            "order of the rows. Sort them as the mesh; if they are, remove this column."
         )
 
 
@@ -76,17 +80,21 @@ def _triples(chosen: list[bool]) -> Iterator[int]:
     yield from (k for k in range(len(chosen) - 3 + 1) if len(chosen) > 3 and not any(chosen[k : k + 3]))
 
 
-def _are_shuffled(at: Table, place: Table) -> bool:
-    """True if the rows of `at` are positions of `place`, in any unit and from any origin, but not in its order."""
+def _in_order(at: Table, place: Table) -> bool | None:
+    """Whether the rows of `at` are the positions of `place`, in any unit and from any origin, in its order.
+
+    False for another order, None for other positions and columns that are no positions.
+    """
     from scipy.spatial import cKDTree
 
     if not (np.isfinite(at).all() and np.isfinite(place).all()):
-        return False
+        return None
     size, own = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (place, at))
     if not (0 < size < np.inf and 0 < own < np.inf):
-        return False
+        return None
     at, place = (at - at.min(axis=0)) / own, (place - place.min(axis=0)) / size
-    sorted_too = np.abs(np.sort(at, axis=0) - np.sort(place, axis=0)).max() <= AT  # fast: other columns end here
-    if not sorted_too or np.abs(at - place).max() <= AT:
-        return False
-    return bool(cKDTree(place).query(at)[0].max() <= AT)
+    if np.abs(at - place).max() <= AT:
+        return True
+    if np.abs(np.sort(at, axis=0) - np.sort(place, axis=0)).max() > AT:  # fast: columns of values end here
+        return None
+    return False if cKDTree(place).query(at)[0].max() <= AT else None
