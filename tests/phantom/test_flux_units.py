@@ -336,6 +336,7 @@ STATED = [
     ("W·cm-2", "cm", None),
     ("W/mm^2 or W/cm^2", "mm", None),
     ("row/mm2", "mm", None),
+    ("W_m20", "mm", None),
     ("5 W. mm 1 to 2", "cm", None),
 ]
 

@@ -12,7 +12,7 @@ LENGTHS = (*MILLIMETRES, "nm", "um", "µm", "dm", "in", "inch")
 # Power per area, such as W/mm^2, mW/cm², W cm-2 or W_per_m2, and whether it is per solid angle as well.
 DENSITY = re.compile(
     r"(?<![A-Za-z])(?P<prefix>[fpnuµ\u03bcmkM]?)W\s*(?:/|_per_|\s+per\s+|_|·|\.|\*|\s)\s*(?P<open>[({])?\s*"
-    r"(?P<length>[mcnuµd]?m)\s*\$?(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²]"
+    r"(?P<length>[mcnuµd]?m)\s*\$?(?:\^|\*\*)?[({]?\s*[-−⁻]?\s*[2²](?!\d)"
     r"(?P<angle>[)}]?\s*(?:/|_per_|_|·|\.|\*|\s)?\s*sr)?(?(open)[)}]?|\$?)"
 )
 
