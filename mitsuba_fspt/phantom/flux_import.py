@@ -114,6 +114,8 @@ def _exitance(
             raise FluxError(f"{raw.source}: {np.count_nonzero(flat)} faces without area carry power. Repair the mesh.")
         return np.divide(found.values, areas, out=np.zeros_like(areas), where=areas > 0), {}
     values = found.values / scale**2
+    if a is None and raw.stated.get(QUANTITY) == "fluence":
+        raise FluxError(f"{raw.source}: its values are fluence by the file, they would be taken for J_n. Give --a.")
     if a is None:
         return values, {}
     if raw.stated.get(QUANTITY) == "exitance":

@@ -196,9 +196,16 @@ class PhantomFile:
     def solve(self, progress: Progress | None = None, band: str | None = None) -> TissueSolution:
         """Solution for the phantom on its mesh, in a band or with the coefficients of no band; see `diffusion.solve`.
 
-        In a band the sources have their share of the power.
+        In a band the sources have their share of the power. A line on stderr says that a file with bands is solved in
+        none.
         """
         optics = self.band(band)
+        if self.bands and band is None:
+            LOG.warning(
+                "fspt: flux solve: no band is given, of the phantom file's %s: the coefficients of [optical] and all "
+                "of the sources' power count. Give the band, where the light is of one.",
+                ", ".join(self.bands),
+            )
         if progress:
             progress("mesh")
         mesh = self.checked_mesh()

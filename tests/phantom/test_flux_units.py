@@ -370,6 +370,15 @@ def test_meshes_in_another_unit_than_their_file_states(tmp_path):
     assert import_flux(tmp_path / "box.ply", np.ones(8), a=1.0).power == pytest.approx(26)
 
 
+def test_fluence_by_a_ply_is_no_exitance(tmp_path):
+    """Its comment states the quantity. Seen to fail: 52 W in place of 26 W with A = 1, without a word."""
+    write_ply(tmp_path / "phi.ply", VERTICES, FACES, {"phi_x": np.ones(8)}, "vertex", {"quantity": "fluence"})
+    with pytest.raises(FluxError, match="its values are fluence by the file, they would be taken for J_n"):
+        import_flux(tmp_path / "phi.ply")
+    assert import_flux(tmp_path / "phi.ply", a=1.0).power == pytest.approx(26)
+    assert import_flux(tmp_path / "phi.ply", np.ones(8)).power == pytest.approx(52)
+
+
 @pytest.mark.parametrize(("units", "stated"), [("inch", "inch"), ("centimeter", "cm"), ("millimeters", None)])
 def test_the_unit_of_a_3mf_is_checked(tmp_path, monkeypatch, units, stated):
     """As trimesh reads it with lxml. Seen to fail: inches were mm, without a word."""

@@ -425,12 +425,15 @@ musp = 0.8
 """
 
 
-def test_bands(tmp_path: Path) -> None:
-    """A band has its own media, in the order of the regions, and its share of the sources' power."""
+def test_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A band has its own media, in the order of the regions, and its share of the sources' power; none is told."""
     phantom = described(tmp_path, SMALL.replace("musp = 1\n", "musp = 1\ng = 0.8\n", 1) + BANDS)
     assert phantom.band("red").media == (Medium(0.01, 0.9, 1.4, 0.8), Medium(0.2, 0.8, 1.37, 0.8))
     assert phantom.band(None).media == (Medium(0.05, 1, 1.37, 0.8), Medium(0.3, 1, 1.37, 0.8))
     assert phantom.solve(band="red").source_power == pytest.approx(0.25 * 2.5)
+    assert not caplog.messages
+    assert phantom.solve().source_power == pytest.approx(2.5)
+    assert ["no band is given, of the phantom file's red" in text for text in caplog.messages] == [True]
 
 
 def test_spreads(tmp_path: Path) -> None:
