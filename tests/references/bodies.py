@@ -16,7 +16,7 @@ from .shapes import Array, Cylinder, Disc, Rectangle, Sphere, dot
 
 Indices = NDArray[np.int64]
 MOST_SPECULAR = 6  # mirrors and panes that a line meets one after the other
-MOST_PAIRS = 1 << 18  # of lines of sight and triangles that are tested at a time
+MOST_PAIRS = 1 << 17  # of lines of sight and triangles that are tested at a time
 BEYOND = 1e-9  # of a line's length: an intersection nearer than this is with the surface where the line starts
 
 
@@ -32,11 +32,22 @@ class Fan:
     step: Array
     behind: float = 0.0
 
+    def some(self, part: slice) -> Fan:
+        """Some of the fans."""
+        return Fan(self.apex[part], self.start[part], self.step[part], self.behind)
+
+    def lines(self, fan: Indices, s: Array) -> tuple[Array, Array]:
+        """Origins and directions of single lines, (n, 3) each, by the numbers of their fans and parameters s, (n,)."""
+        direction = self.start[fan] + s[:, None] * self.step[fan]
+        return self.apex[fan] - self.behind * direction, direction
+
 
 class BodyShape(Protocol):
     """What a body's shape gives: first positive parameter on lines and the face met; normal; edges of fans."""
 
     def meet(self, origin: Array, direction: Array) -> tuple[Array, Indices]: ...
+
+    def meet_face(self, origin: Array, direction: Array, face: Indices) -> Array: ...
 
     def outward(self, points: Array, face: Indices) -> Array: ...
 
@@ -100,21 +111,44 @@ class Body:
         return self
 
 
+def first_met(bodies: Sequence[Body], origin: Array, direction: Array) -> tuple[Array, Indices, Indices]:
+    """What lines of sight meet first: parameter, number of the body (-1: nothing) and its face, each (n,)."""
+    met = [body.shape.meet(origin, direction) for body in bodies]
+    nearest, faces = np.stack([s for s, _ in met]), np.stack([face for _, face in met])
+    first = np.argmin(nearest, axis=0)
+    at = first, np.arange(len(origin))
+    return nearest[at], np.where(np.isfinite(nearest[at]), first, -1), faces[at]
+
+
+def seen_on(bodies: Sequence[Body], met: Indices, origin: Array, direction: Array) -> Array:
+    """Radiance [W/mm²/sr] along lines of sight (n,) to opaque bodies.
+
+    met : numbers of the bodies that lines meet first, and of their faces, (2, n)
+    """
+    value, (first, face) = np.zeros(len(origin)), met
+    for number, body in enumerate(bodies):
+        (mine,) = np.nonzero(first == number)
+        if len(mine) and body.exitance is not None:
+            way, own = direction[mine], face[mine]
+            s = body.shape.meet_face(origin[mine], way, own)
+            hit = np.isfinite(s)  # on an edge, a line may miss by rounding
+            mine, way, own = mine[hit], way[hit], own[hit]
+            value[mine] = body.radiance(origin[mine] + s[hit, None] * way, way, own)
+    return value
+
+
 def seen_along(bodies: Sequence[Body], origin: Array, direction: Array, specular: int = MOST_SPECULAR) -> Array:
     """Radiance [W/mm²/sr] along lines of sight (n,), through panes and off mirrors (Eq. M.19)."""
     value = np.zeros(len(origin))
     if not len(origin):
         return value
-    met = [body.shape.meet(origin, direction) for body in bodies]
-    nearest = np.stack([s for s, _ in met])
-    first = np.argmin(nearest, axis=0)
-    first[~np.isfinite(nearest.min(axis=0))] = -1
+    nearest, first, faces = first_met(bodies, origin, direction)
     for number, body in enumerate(bodies):
         (mine,) = np.nonzero(first == number)
         if not len(mine) or (body.role == "opaque" and body.exitance is None):
             continue
-        way, face = direction[mine], met[number][1][mine]
-        points = origin[mine] + nearest[number, mine, None] * way
+        way, face = direction[mine], faces[mine]
+        points = origin[mine] + nearest[mine, None] * way
         if body.role == "opaque":
             value[mine] = body.radiance(points, way, face)
             continue
@@ -218,6 +252,10 @@ class Simple:
         """First positive parameters (n,), inf for none; the face is always 0."""
         return self.shape.meet(origin, direction), np.zeros(len(origin), int)
 
+    def meet_face(self, origin: Array, direction: Array, face: Indices) -> Array:
+        """First positive parameters (n,), inf for none."""
+        return self.shape.meet(origin, direction)
+
     def outward(self, points: Array, face: Indices) -> Array:
         """Unit normals, (n, 3)."""
         return self.shape.outward(points)
@@ -310,6 +348,12 @@ class Triangles:
             best[part] = ahead[np.arange(len(nearest)), nearest]
             face[part] = self.number[nearest]
         return best, face
+
+    def meet_face(self, origin: Array, direction: Array, face: Indices) -> Array:
+        """Parameters (n,) at which lines meet the planes of faces; `face` in the whole mesh."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        normal, own = np.cross(b - a, c - a), np.searchsorted(self.number, face)
+        return dot(a[own] - origin, normal[own]) / dot(direction, normal[own])
 
     def outward(self, points: Array, face: Indices) -> Array:
         """Unit normals, (n, 3); `face` in the whole mesh."""

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .bodies import Body, Fan, reflected, roots, seen_along
+from .bodies import Body, Fan, first_met, reflected, roots, seen_along, seen_on
 from .camera import ReferenceCamera, Stops
 from .sampled import lattice
 from .shapes import Array, dot, unit_disc
@@ -30,6 +30,7 @@ FEW, UNMET = 16, 6.9  # fans with light from which a scatter can be estimated; �
 # computed, because all fans of the first may miss a corner in the pixel.
 LINES = (64, 512, 2048, 8192, 32768)
 MOST_LINES = 8192  # largest number of fans in a shift, unless another is requested
+MOST_FANS = 1 << 12  # that are computed at a time
 GAUSS = 8  # nodes on a piece between two edges
 SHORTEST = 1e-13  # of a fan's length: shorter pieces are left out
 
@@ -132,6 +133,11 @@ class FanReference:
 
     def _along(self, bodies: Sequence[Body], fan: Fan) -> Array:
         """Mean of cos⁴θ times radiance over each fan, (n,)."""
+        parts = range(0, len(fan.apex), MOST_FANS)
+        return np.concatenate([self._along_some(bodies, fan.some(slice(at, at + MOST_FANS))) for at in parts])
+
+    def _along_some(self, bodies: Sequence[Body], fan: Fan) -> Array:
+        """Mean of cos⁴θ times radiance over each of at most `MOST_FANS` fans, (n,)."""
         edges = [self._stop_edges(fan), *(body.edges(fan) for body in bodies)]
         for mirror in bodies:
             if mirror.role != "opaque":
@@ -142,7 +148,13 @@ class FanReference:
         count = len(at)
         ends = np.concatenate([np.zeros((count, 1)), at, np.ones((count, 1))], axis=1)
         fan_of, piece = np.nonzero(np.diff(ends, axis=1) > SHORTEST)
-        low, high = ends[fan_of, piece], ends[fan_of, piece + 1]
+        low, high, met = ends[fan_of, piece], ends[fan_of, piece + 1], None
+        if all(body.role == "opaque" for body in bodies):
+            # Between two edges all lines meet the same face: the line in the middle finds it.
+            _, first, face = first_met(bodies, *fan.lines(fan_of, (low + high) / 2))
+            glows = np.isin(first, [number for number, body in enumerate(bodies) if body.exitance is not None])
+            fan_of, low, high = fan_of[glows], low[glows], high[glows]
+            met = np.repeat([first[glows], face[glows]], GAUSS, axis=1)
         node, weight = np.polynomial.legendre.leggauss(GAUSS)
         node, weight = (node + 1) / 2, weight / 2
         # Nodes are dense towards both ends, by a map that makes the square root at a limb linear.
@@ -150,23 +162,24 @@ class FanReference:
         s = low[:, None] + (high - low)[:, None] * place
         share = (high - low)[:, None] * (weight * slope)
         row = np.repeat(fan_of, GAUSS)
-        value = self._integrand(bodies, fan, row, s.ravel()) * share.ravel()
+        value = self._integrand(bodies, *fan.lines(row, s.ravel()), met) * share.ravel()
         return np.bincount(row, value, minlength=count).astype(np.float64)
 
-    def _integrand(self, bodies: Sequence[Body], fan: Fan, row: Indices, s: Array) -> Array:
-        """cos⁴θ times radiance [W/mm²/sr] on single lines of fans, (n,); 0 where a stop blocks the line."""
+    def _integrand(self, bodies: Sequence[Body], origin: Array, direction: Array, met: Indices | None) -> Array:
+        """cos⁴θ times radiance [W/mm²/sr] on lines of sight, (n,); 0 where a stop blocks the line.
+
+        met : the bodies and faces that lines meet first, (2, n); None: not known
+        """
         stops, u = self.stops, self.camera.focus_distance
-        direction = fan.start[row] + s[:, None] * fan.step[row]
-        origin = fan.apex[row] - fan.behind * direction
         through = stops.lens_radius, stops.field_radius
-        inside = np.ones(len(s), bool)
+        inside = np.ones(len(origin), bool)
         for radius, depth in zip(through, (0.0, u), strict=True):
             if math.isfinite(radius):
                 at = origin + ((depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
                 inside &= np.hypot(at[:, 0], at[:, 1]) <= radius
         cos2 = direction[:, 2] ** 2 / dot(direction, direction)
-        value = np.zeros(len(s))
-        value[inside] = seen_along(bodies, origin[inside], direction[inside])
+        value, lines = np.zeros(len(origin)), (origin[inside], direction[inside])
+        value[inside] = seen_along(bodies, *lines) if met is None else seen_on(bodies, met[:, inside], *lines)
         return cos2**2 * value
 
     def _stop_edges(self, fan: Fan) -> Array:
