@@ -96,7 +96,7 @@ def _add(
     to_lens /= distance
     cos_s = dr.dot(si.n, to_lens)
     lit = (dr.squared_norm(pupil) <= 1) & (passes > 0) & (cos_s > 0)
-    lit &= ~hidden(scene, si.p, lens_point, lit)
+    lit &= ~hidden(scene, si.p, si.n, lens_point, lit)
     si.initialize_sh_frame()
     si.wi = si.to_local(to_lens)
     radiance = dr.select(lit, scalar(emitter.eval(si, lit)), 0)

@@ -18,28 +18,33 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Start of a ray that leaves the surface: these shares of the largest coordinate and of the distance [mm/mm], some
 # hundred times the rounding of float32.
 CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
+RESOLVED = 4e-7  # of the largest coordinate: height above a surface at which a ray does not meet it in float32
 
 
-def hidden(scene: mi.Scene, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
+def hidden(scene: mi.Scene, point: mi.Point3f, normal: mi.Normal3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
     """True where a surface lies between a surface point and a point of the lens.
 
     Neighbouring lines, mostly of one piece of a surface, are traced as one packet in scenes of meshes alone: in packets
     Embree misses some points of a disk.
     """
     together = all(shape.is_mesh() for shape in scene.shapes())
-    return scene.ray_test(ray_to_lens(point, lens_point), coherent=together, active=active)
+    return scene.ray_test(ray_to_lens(point, normal, lens_point), coherent=together, active=active)
 
 
-def ray_to_lens(point: mi.Point3f, lens_point: mi.Point3f) -> mi.Ray3f:
+def ray_to_lens(point: mi.Point3f, normal: mi.Normal3f, lens_point: mi.Point3f) -> mi.Ray3f:
     """Ray from a surface point that ends at a point of the lens.
 
-    It starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal by
-    9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
+    It starts a little further along its own direction, and where it leaves the surface at a flat angle as far as it
+    takes to be above it. Mitsuba's `spawn_ray` would move the start along the normal by 9e-5 of the point's distance
+    from the origin, and with it the borders of shadows by a hundredth of a pixel.
     """
     way = mi.Vector3f(lens_point - point)
     distance = dr.norm(way)
     direction = way / distance
+    height = RESOLVED * dr.max(dr.abs(point), axis=0)
     clear = clear_of(point) + CLEAR_OF_DISTANCE * distance
+    rise = dr.dot(normal, direction)
+    clear = dr.select(rise * distance > 2 * height, dr.maximum(clear, height / rise), clear)
     ray = mi.Ray3f(point + clear * direction, direction)
     ray.maxt = distance - clear
     return ray

@@ -27,7 +27,7 @@ from ..quadrature import MOST_SPECULAR, Quadrature
 from .glass import Glass
 from .mirror import Mirror, Untraced, index_of
 from .nested_bsdfs import blended_parts
-from .occlusion import hidden, ray_to_lens
+from .occlusion import RESOLVED, hidden, ray_to_lens
 from .plane import FLAT, Plane
 from .poses import Deviating
 
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 SMOOTHEST = 1e-4  # roughness below which Mitsuba's rough conductor has the lobe of this roughness: a mirror's
 ROUNDING = 2e-6  # of the largest coordinate: margin of a box
 FAINTER = 0.1  # least weight of courses with weaker lobes, where they are followed apart, over that of others
-LIFT = 4e-7  # of a shape's largest coordinate: distance at which its sides differ in float32
 DELTA = {
     "null": mi.BSDFFlags.Null,
     "transmission": mi.BSDFFlags.DeltaTransmission,
@@ -110,7 +109,7 @@ class Specular:
             beside = zip(bent, boxes, planes, strict=True)
             others = [box for (other, _), box, plane in beside if other is not shape or len(plane) != 1]
             reach[number] = _around([*glowing, *others])
-            lift[number] = LIFT * np.abs(_box(shape)).max()
+            lift[number] = RESOLVED * np.abs(_box(shape)).max()
         return cls(
             tuple(shape.id() for shape, _ in shapes),
             tuple(name for name in DELTA if name in lobes) or ("null",),
@@ -242,15 +241,20 @@ def _separate(planes: tuple[Plane, ...], camera: Camera, glowing: Sequence[Box])
 
 
 def transmission(
-    scene: mi.Scene, specular: Specular | None, point: mi.Point3f, lens_point: mi.Point3f, active: mi.Bool
+    scene: mi.Scene,
+    specular: Specular | None,
+    point: mi.Point3f,
+    normal: mi.Normal3f,
+    lens_point: mi.Point3f,
+    active: mi.Bool,
 ) -> mi.Float:
     """Share of the light of a surface point that reaches a point of the lens undeviated; 0 where it is occluded.
 
     Through null lobes alone: a surface that deviates light counts as an occluder.
     """
     if specular is None:
-        return dr.select(hidden(scene, point, lens_point, active), 0, mi.Float(1))
-    ray = ray_to_lens(point, lens_point)
+        return dr.select(hidden(scene, point, normal, lens_point, active), 0, mi.Float(1))
+    ray = ray_to_lens(point, normal, lens_point)
     most = dr.opaque(mi.UInt32, specular.most)
 
     def surface(share: mi.Float, ray: mi.Ray3f, count: mi.UInt32, alive: mi.Bool) -> tuple:

@@ -334,7 +334,7 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     at = _on_elements(surface, elements, camera, counts)
     if hidden and len(scene.shapes()) > 1:
-        at.radiance = dr.select(_in_sight(scene, camera, at.place, specular), at.radiance, 0)
+        at.radiance = dr.select(_in_sight(scene, camera, at.place, at.normal, specular), at.radiance, 0)
     columns = (at.radiance, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
@@ -348,8 +348,8 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
 @dataclass
 class _OnElements:
     """Values at points of elements: `radiance` towards the point of the pupil highest above them, area of the element's
-    `image` from there [pixels²]; cosine, front, edge_on, signed `blur`, `centre` on film as in `Points`; `place` in the
-    world.
+    `image` from there [pixels²]; cosine, front, edge_on, signed `blur`, `centre` on film as in `Points`; `place` and
+    `normal` in the world.
     """
 
     radiance: mi.Float
@@ -360,6 +360,7 @@ class _OnElements:
     blur: mi.Float
     centre: mi.Point2f
     place: mi.Point3f
+    normal: mi.Normal3f
 
 
 def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, counts: Index) -> _OnElements:
@@ -377,18 +378,21 @@ def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, c
     radiance, place = scalar(surface.radiance(si, to_lens, mi.Bool(True))), camera.film_map.from_ideal(centre)
     # The rim below lies as far under the middle of the pupil as the rim above lies over it.
     edge_on = dr.select((cosine > 0) & (2 * front <= dr.dot(si.n, to_rim)), mi.Float(1), 0)
-    at = _OnElements(radiance, image, cosine, front, edge_on, blur, place, si.p)
+    at = _OnElements(radiance, image, cosine, front, edge_on, blur, place, si.p, si.n)
     dr.eval(at)
     return at
 
 
-def _in_sight(scene: mi.Scene, camera: Camera, place: mi.Point3f, specular: Specular | None) -> mi.Bool:
+def _in_sight(
+    scene: mi.Scene, camera: Camera, place: mi.Point3f, normal: mi.Normal3f, specular: Specular | None
+) -> mi.Bool:
     """True for points that one of twelve points of the pupil is visible from."""
     x, y = (mi.Float(column) for column in twelve(False).pupil.T)
 
     def test(k: mi.UInt32, seen: mi.Bool) -> tuple[mi.Bool]:
         pupil = mi.Point2f(dr.gather(mi.Float, x, k), dr.gather(mi.Float, y, k))
-        return (seen | (transmission(scene, specular, place, camera.arrival(place, pupil)[1], ~seen) > 0),)
+        lens_point = camera.arrival(place, pupil)[1]
+        return (seen | (transmission(scene, specular, place, normal, lens_point, ~seen) > 0),)
 
     return repeat(dr.opaque(mi.UInt32, len(twelve(False))), test, mi.Bool(False))[0]
 

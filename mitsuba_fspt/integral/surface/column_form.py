@@ -234,11 +234,11 @@ class FaceLines:
         if faces.shadows:
             ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
             mixed = active & dr.gather(mi.Bool, mi.Bool(faces.mixed), face)
-            lit_part = LitPart.of(scene, camera, node, ends, middle.p, mixed)
+            lit_part = LitPart.of(scene, camera, node, ends, middle, mixed)
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
             aim = dr.select(lit_part.some, node, aim)
-            open_spot = ~hidden(scene, spot.p, camera.open_arrival(spot.p, aim)[1], active)
+            open_spot = ~hidden(scene, spot.p, middle.n, camera.open_arrival(spot.p, aim)[1], active)
             active &= lit_part.some | open_spot
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)

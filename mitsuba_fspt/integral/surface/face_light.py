@@ -395,6 +395,6 @@ def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Inde
     spot, _ = elements.place(index, within)
     _, lens_point, arrival, _, share = camera.open_arrival(spot.p, aim)
     reaches = (share * arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
-    blocked = reaches & hidden(scene, spot.p, lens_point, reaches)
+    blocked = reaches & hidden(scene, spot.p, spot.n, lens_point, reaches)
     counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
     return 1 - counted[1] / np.maximum(counted[0], 1)

@@ -45,14 +45,14 @@ class LitPart:
         camera: Camera,
         node: mi.Point2f,
         ends: list[mi.Point3f],
-        middle: mi.Point3f,
+        middle: mi.SurfaceInteraction3f,
         active: mi.Bool,
     ) -> LitPart:
         """Of triangles with the corners `ends` as seen through a node of the pupil; found by bisection."""
 
         def open_from(point: mi.Point3f, asked: mi.Bool) -> mi.Bool:
-            start = point + INWARD * (middle - point)
-            return asked & ~hidden(scene, start, camera.open_arrival(start, node)[1], asked)
+            start = point + INWARD * (middle.p - point)
+            return asked & ~hidden(scene, start, middle.n, camera.open_arrival(start, node)[1], asked)
 
         seen = [open_from(end, active) for end in ends]
         some = active & ((seen[0] != seen[1]) | (seen[0] != seen[2]))

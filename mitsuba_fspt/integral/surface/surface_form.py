@@ -199,7 +199,7 @@ class _Refinement:
         active = (cos_s > 0) & (arrival > 0)
         through = mi.Float(1)
         if self.hidden:
-            through = transmission(self.scene, self.specular, spot.p, lens_point, active)
+            through = transmission(self.scene, self.specular, spot.p, spot.n, lens_point, active)
             active &= through > 0
         spot.sh_frame.n = spot.n  # not the normal that a mesh is shaded with
         spot.initialize_sh_frame()
