@@ -1,13 +1,15 @@
 """Errors of the integral on random scenes, against an independent float64 reference.
 
     python scripts/audit.py [--scenes 10] [--seed 0] [--family spheres,plates] [--rtol 1e-3] [--finer 1] [--out docs]
+                            [--keep]
     python scripts/audit.py --ablate all|order,slant [--matrix] [--scenes 3] [--seed 0] [--family …] [--rtol 1e-3]
     python scripts/audit.py --matrix [--scenes 10] [--seed 0] [--family boxes,meshes] [--rtol 1e-3] [--out docs]
 
 Scenes of every family of tests/references/random_scenes.py are rendered by `fspt_integral`. tests/references/fans.py
 computes the power, with an error of its own, on 24 pixels of each: 16 where errors are likely (large stated errors,
 edges, strong curvature of the image) and 8 random ones. A pixel counts as beyond a limit only if it exceeds the limit
-by more than the reference's error. Writes audit.csv, one row per scene, and prints the table by family.
+by more than the reference's error. Writes audit.csv, one row per scene, and prints the table by family. With `--keep`
+rows of families that are not rendered now stay in file and table: all families together take an hour.
 
 With `--ablate` scenes are computed without each threshold of `integral/estimator.py` in turn, with `--matrix` without
 each of `ColumnRule`: how many of all pixels are beyond `rtol` and beyond the stated error, and what it costs. The image
@@ -106,6 +108,7 @@ def main() -> None:
     parser.add_argument("--finer", type=int, default=1, help="times as many pixels along each side of the film")
     parser.add_argument("--ablate", help="thresholds to do without, one by one, or all")
     parser.add_argument("--matrix", action="store_true", help="products of the transport matrix in place of images")
+    parser.add_argument("--keep", action="store_true", help="keep the rows of other families that the file has")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--readme", type=Path, help="file whose table 'audit', or 'audit_matrix', is replaced")
     arguments = parser.parse_args()
@@ -122,8 +125,8 @@ def main() -> None:
         path = arguments.out / f"ablation{'_matrix' * arguments.matrix}.csv"
         ablate([(one, seed) for one in names for seed in seeds], wanted, arguments.rtol, arguments.matrix, path)
         return
-    audits: list[Audit] = []
     name = "audit_matrix" if arguments.matrix else "audit"
+    audits = _kept(arguments.out / f"{name}.csv", names) if arguments.keep else []
     for family in names:
         for seed in seeds:
             pixels = arguments.likely, arguments.random
@@ -134,6 +137,15 @@ def main() -> None:
     print(f"\n{text}")
     if arguments.readme:
         markdown_tables.write(arguments.readme, name, text)
+
+
+def _kept(path: Path, names: Sequence[str]) -> list[Audit]:
+    """Rows of a file but for those of families with these names."""
+    kinds = {"str": str, "int": int, "float": float}
+    types = {field.name: kinds[str(field.type)] for field in fields(Audit)}
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["family"] not in names]
+    return [Audit(**{name: types[name](value) for name, value in row.items()}) for row in rows]
 
 
 def _write(path: Path, audits: Sequence[Audit]) -> None:
