@@ -11,7 +11,7 @@ from ..optics.boundary import boundary_a
 from ..runtime.errors import ExitanceError, FluxError
 from ..runtime.numbers import number
 from .formats import MeshLike, RawMesh, SurfaceValues, ValuesLike, read_mesh, surface_values
-from .formats.stated_units import LENGTH_UNIT, QUANTITY, VALUE_UNIT, require_density_unit, require_length_unit
+from .formats.stated_units import LENGTH_UNIT, QUANTITY, UP, VALUE_UNIT, require_density_unit, require_length_unit
 from .length_unit import millimetres, own_unit, unit_warning
 from .phantom import UNIT, Phantom, require_finite, require_single, shares
 from .surface_mesh import closure, face_areas, repeated
@@ -83,7 +83,7 @@ def import_flux(
 
 
 def _checked_unit(raw: RawMesh, found: SurfaceValues, unit: str, given: bool) -> dict[str, str]:
-    """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, and a warning of odd size.
+    """Entries of the provenance: the unit of the mesh if it is neither mm nor `given`, its axes, a warning of odd size.
 
     Raises FluxError where the file states other units.
     """
@@ -92,6 +92,8 @@ def _checked_unit(raw: RawMesh, found: SurfaceValues, unit: str, given: bool) ->
         require_density_unit(raw.source, text, unit)
     scaled = f"{unit}, by the standard of its format; scaled to mm, values from W/{unit}^2 to W/mm^2"
     entries = {} if given or unit == "mm" else {"mesh_unit": scaled}
+    if UP in raw.stated:
+        entries["mesh_axes"] = f"as in the file, {raw.stated[UP]} up by its standard; a scene turns the phantom about z"
     with np.errstate(over="ignore"):  # Phantom refuses vertices so far away
         diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
     warning = unit_warning(diagonal, unit)

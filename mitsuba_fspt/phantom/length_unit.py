@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..runtime.errors import FluxError
 
-IN_METRES = (".glb", ".gltf")  # by the standard of glTF 2.0
+GLTF = (".glb", ".gltf")  # in metres, y up, by the standard of glTF 2.0
 # Usual diagonals of the bounding box of phantoms and small animals [mm]. For any other a warning suggests the unit with
 # which the diagonal would be usual.
 PASSED, USUAL = (5.0, 1000.0), (10.0, 500.0)
@@ -23,7 +23,7 @@ def millimetres(length_unit: str, where: str) -> float:
 
 def own_unit(mesh: object) -> str:
     """Unit of a mesh whose unit is not given: m of a glTF file, mm of any other and of arrays."""
-    return "m" if isinstance(mesh, str | Path) and Path(mesh).suffix.lower() in IN_METRES else "mm"
+    return "m" if isinstance(mesh, str | Path) and Path(mesh).suffix.lower() in GLTF else "mm"
 
 
 def is_usual(diagonal: float) -> bool:

@@ -104,7 +104,10 @@ def test_values_beside_several_meshes_without_an_order_are_refused(tmp_path):
 
 
 def test_a_glb_is_in_metres(tmp_path):
-    """By glTF's standard; its values are W/m², so that the power is that of the same numbers in W/mm² and mm."""
+    """By glTF's standard; its values are W/m², so that the power is that of the same numbers in W/mm² and mm.
+
+    The report says that y is up in such a file. Seen to fail: without a word.
+    """
     SPHERE.export(tmp_path / "mesh.glb")
     in_mm = import_flux(tmp_path / "mesh.glb", law(VERTICES), length_unit="mm")
     phantom = import_flux(tmp_path / "mesh.glb", law(VERTICES))
@@ -114,6 +117,8 @@ def test_a_glb_is_in_metres(tmp_path):
         phantom.report()["mesh_unit"] == "m, by the standard of its format; scaled to mm, values from W/m^2 to W/mm^2"
     )
     assert "mesh_unit" not in in_mm.report()
+    assert "y up by its standard" in phantom.report()["mesh_axes"]
+    assert phantom.report()["mesh_axes"] == in_mm.report()["mesh_axes"]
 
 
 def test_obj_of_a_modeller_keeps_the_order_of_its_lines(tmp_path):

@@ -379,18 +379,30 @@ def test_fluence_by_a_ply_is_no_exitance(tmp_path):
     assert import_flux(tmp_path / "phi.ply", np.ones(8)).power == pytest.approx(52)
 
 
-@pytest.mark.parametrize(("units", "stated"), [("inch", "inch"), ("centimeter", "cm"), ("millimeters", None)])
-def test_the_unit_of_a_3mf_is_checked(tmp_path, monkeypatch, units, stated):
-    """As trimesh reads it with lxml. Seen to fail: inches were mm, without a word."""
+@pytest.mark.parametrize(
+    ("kind", "units", "stated"),
+    [
+        ("3mf", "inch", "inch"),
+        ("3mf", "centimeter", "cm"),
+        ("3mf", "millimeters", None),
+        ("dae", "0.01 * meters", "cm"),
+        ("dae", "0.0254 * meters", "0.0254 * meters"),
+        ("dae", "0.001 * meters", None),
+        ("dae", "meters", None),  # trimesh's word for a file that states no unit, too
+        ("step", "meters", "m"),
+    ],
+)
+def test_the_unit_of_a_file_of_trimesh_is_checked(tmp_path, monkeypatch, kind, units, stated):
+    """As trimesh reads it with lxml, pycollada or cascadio. Seen to fail: inches were mm, without a word."""
     mesh = trimesh.Trimesh(VERTICES, FACES, process=False, metadata={"fspt_parts": 1})
     mesh.units = units
     monkeypatch.setattr("mitsuba_fspt.phantom.formats.surface_files.load_triangles", lambda path, kind: mesh)
-    (tmp_path / "box.3mf").touch()
+    (tmp_path / f"box.{kind}").touch()
     if stated is None:
-        assert import_flux(tmp_path / "box.3mf", np.ones(8)).area == pytest.approx(52)
+        assert import_flux(tmp_path / f"box.{kind}", np.ones(8)).area == pytest.approx(52)
         return
-    with pytest.raises(FluxError, match=f"its vertices are in '{stated}' by the file"):
-        import_flux(tmp_path / "box.3mf", np.ones(8))
+    with pytest.raises(FluxError, match=re.escape(f"its vertices are in '{stated}' by the file")):
+        import_flux(tmp_path / f"box.{kind}", np.ones(8))
 
 
 def test_quadrangles_are_no_tetrahedra(tmp_path):

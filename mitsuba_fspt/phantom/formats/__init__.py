@@ -17,7 +17,7 @@ from .mmc import mmc_mesh, read_mmc
 from .nirfast import nirfast_mesh, read_nirfast
 from .ply import read_ply
 from .raw import Field, RawMesh, SurfaceValues, surface_values
-from .stated_units import LENGTH_UNIT
+from .stated_units import LENGTH_UNIT, UP
 from .surface_files import read_arrays, read_obj, read_off, read_trimesh
 from .table import column, labelled_values
 
@@ -122,5 +122,5 @@ def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh
     else:
         name, array, label = "values", column(np.asarray(values), [], field, "values"), ""
     source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
-    stated = {key: text for key, text in raw.stated.items() if key == LENGTH_UNIT}
+    stated = {key: text for key, text in raw.stated.items() if key in (LENGTH_UNIT, UP)}
     return replace(raw, source=source, fields=(Field(name, array, None, label=label),), stated=stated)

@@ -7,7 +7,7 @@ import re
 from ...runtime.errors import LONGEST_TEXT, FluxError, one_line
 from ..length_unit import MILLIMETRES
 
-LENGTH_UNIT, VALUE_UNIT, QUANTITY = "length_unit", "unit", "quantity"  # keys of what a file states
+LENGTH_UNIT, VALUE_UNIT, QUANTITY, UP = "length_unit", "unit", "quantity", "up"  # keys of what a file states
 LENGTHS = (*MILLIMETRES, "nm", "um", "µm", "dm", "in", "inch")
 # Power per area, such as W/mm^2, mW/cm², W cm-2 or W_per_m2, and whether it is per solid angle as well.
 DENSITY = re.compile(

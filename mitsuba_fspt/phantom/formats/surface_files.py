@@ -11,16 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import BackendError, FluxError, one_line
+from ..length_unit import GLTF
 from ..surface_mesh import merge
 from .raw import Field, RawMesh, scalars
-from .stated_units import LENGTH_UNIT, length_of_name
+from .stated_units import LENGTH_UNIT, UP, length_of_name
 from .table import read_npz, require_file
 
 if TYPE_CHECKING:
     import trimesh
 
-# Of its standard, and trimesh's for a file without one; others, such as inch, are refused.
-UNITS_OF_3MF = {"millimeter": "mm", "millimeters": "mm", "centimeter": "cm", "meter": "m"}
+# Names that trimesh gives to the units of 3MF, of COLLADA, and of STEP, which it converts to m. Others, such as inch,
+# are refused. A COLLADA file in metres may be one that states none.
+UNITS = {"millimeter": "mm", "millimeters": "mm", "centimeter": "cm", "meter": "m", "meters": "m"}
+UNITS |= {"0.001 * meters": "mm", "0.01 * meters": "cm"}
+STATED_BY, METRES_IF_UNSTATED = ("3mf", "dae", "zae", "step", "stp"), ("dae", "zae")
 PARTS = "fspt_parts"  # key of trimesh's metadata
 # Formats that trimesh reads itself; it would pass any other on to meshio.
 KINDS = ("stl", "off", "glb", "gltf", "3mf", "dae", "zae", "3dxml", "xaml", "ctm", "step", "stp")
@@ -126,8 +130,17 @@ def read_trimesh(path: Path) -> RawMesh:
     if kind == "stl":
         points, cells = merge(points, cells)
         return RawMesh(points, cells, path.name, point_order=False)
-    stated = {LENGTH_UNIT: UNITS_OF_3MF.get(loaded.units, loaded.units)} if kind == "3mf" and loaded.units else {}
+    length = _stated_length(kind, loaded.units)
+    stated = {} if length is None else {LENGTH_UNIT: length}
+    stated |= {UP: "y"} if path.suffix.lower() in GLTF else {}
     return RawMesh(points, cells, path.name, _fields(loaded), parts=loaded.metadata[PARTS], stated=stated)
+
+
+def _stated_length(kind: str, units: str | None) -> str | None:
+    """Unit of length that a file states, from trimesh's name of it; None for a file that states none."""
+    if kind not in STATED_BY or not units or (kind in METRES_IF_UNSTATED and units == "meters"):
+        return None
+    return UNITS.get(units, units)
 
 
 def load_triangles(path: Path, kind: str, **options: Any) -> trimesh.Trimesh:
