@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +18,7 @@ from ..runtime.interrupt import in_threads
 from ..tissue.border_surface import nearest_points
 from ..tissue.diffusion import Tissue
 from ..tissue.solution import TissueSolution
-from .measurement import Measurement
+from .measurement import Measurement, told
 from .model_error import MODEL_ERRORS
 from .surface import Surface
 from .transport_matrix import TransportMatrix
@@ -27,7 +26,6 @@ from .transport_matrix import TransportMatrix
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Result = TypeVar("Result")
-LOG = logging.getLogger("mitsuba_fspt")
 # Distance of the matrix's surface from the tissue's border, over the edge of the tetrahedra: the largest one, and that
 # from which on a line reports it. The sources are wrong by about that distance, which intervals do not contain.
 OFF_BORDER = 0.25
@@ -46,6 +44,7 @@ class BandImages:
     measurement : of all pixels;  rows : (N,) the pixels that are fitted
     tissue : with the optical coefficients of the band;  share : of a source's power that is emitted in the band
     transport : (N, V) power on the pixels from J_n at the surface's vertices [mm²]
+    warnings : line of stderr on a surface that is not quite the border of the tissue
     """
 
     name: str | None
@@ -56,6 +55,7 @@ class BandImages:
     share: float
     rows: Index
     transport: csr_array
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -79,8 +79,7 @@ class BandImages:
                 f"locate: the pixels that see the surface hold {found.power.sum():.3g} W in total, no light. Check the "
                 "images, their background and the order of the views."
             )
-        found._require_border()
-        return found
+        return replace(found, warnings=tuple(told("locate", found._off_border())))
 
     @property
     def power(self) -> Array:
@@ -252,8 +251,8 @@ class BandImages:
         image[self.rows] = values
         return image.reshape(self.matrix.image_shape)
 
-    def _require_border(self) -> None:
-        """Raise InversionError where the matrix's surface is not the border of the tissue."""
+    def _off_border(self) -> list[str]:
+        """Line on the distance of the matrix's surface from the border of the tissue, if any; InversionError if far."""
         mesh, points = self.tissue.mesh, self.surface.vertices
         nearest = nearest_points(points, self._border)
         if mesh.snap is not None:
@@ -264,12 +263,12 @@ class BandImages:
                 f"locate: the surface of the matrix is up to {away:.3g} mm away from the phantom's border. Give the "
                 "matrix of this phantom's surface; its mesh without to_world is in the frame of the phantom file."
             )
-        if away > REPORTED * mesh.edge:
-            LOG.warning(
-                "fspt: locate: the surface of the matrix is up to %.3g mm away from the phantom's border, which the "
-                "stated errors do not contain.",
-                away,
-            )
+        if away <= REPORTED * mesh.edge:
+            return []
+        return [
+            f"the surface of the matrix is up to {away:.3g} mm away from the phantom's border, which the stated errors "
+            "do not contain."
+        ]
 
 
 def of_each(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:

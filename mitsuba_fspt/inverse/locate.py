@@ -234,7 +234,8 @@ def _located(fit: SourceFit, spreads: Sequence[Sequence[Spread]], options: _Opti
     _tell(linear, p_values, count, options.settings)
     power = fit.power / fit.factors(found)[fit.view]
     density = replace(grid, sigma=found.sigma, power=power).density(report)
-    warnings = tell_misfit("locate", found.cost, len(fit.power), numbers * count, fit.noise(found))
+    warnings = list(dict.fromkeys(line for band in fit.bands for line in band.warnings))
+    warnings += tell_misfit("locate", found.cost, len(fit.power), numbers * count, fit.noise(found))
     warnings += told("locate", fit.structure(found).lines())
     optics = own.coefficients(found) if own else {}
     intervals = Intervals(covariance, z, options.confidence, linear, p_values, extents)
