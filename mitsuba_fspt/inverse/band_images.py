@@ -44,7 +44,7 @@ class BandImages:
     measurement : of all pixels;  rows : (N,) the pixels that are fitted
     tissue : with the optical coefficients of the band;  share : of a source's power that is emitted in the band
     transport : (N, V) power on the pixels from J_n at the surface's vertices [mm²]
-    warnings : line of stderr on a surface that is not quite the border of the tissue
+    warnings : lines of stderr on a surface that is not quite the border of the tissue, and on its coefficients
     """
 
     name: str | None
@@ -79,7 +79,7 @@ class BandImages:
                 f"locate: the pixels that see the surface hold {found.power.sum():.3g} W in total, no light. Check the "
                 "images, their background and the order of the views."
             )
-        return replace(found, warnings=tuple(told("locate", found._off_border())))
+        return replace(found, warnings=tuple(told("locate", [*found._off_border(), *tissue.warnings()])))
 
     @property
     def power(self) -> Array:

@@ -18,7 +18,6 @@ from scipy.stats import norm
 
 from ..images.exposure import Exposure
 from ..images.image import Image
-from ..optics.media import scattering_warning
 from ..runtime.errors import InversionError, renamed
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
@@ -300,8 +299,6 @@ def _band_images(
             "coefficients of [optical]. Give the band, where images are of one.",
             ", ".join(described.bands),
         )
-    if warning := scattering_warning([medium for *_, optics in read for medium in optics.media]):
-        LOG.warning("fspt: locate: %s", warning)
     bands, elements = [], Elements(mesh, described.order).assembled()
     for one, (surface, measurement, optics) in zip(given, read, strict=True):
         tissue = Tissue(

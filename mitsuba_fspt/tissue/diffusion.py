@@ -37,6 +37,7 @@ Index = NDArray[np.int64]
 
 LOG = logging.getLogger("mitsuba_fspt")
 LARGEST_IMBALANCE = 1e-5
+SAME_INDEX = 0.03  # relative change of n inside the tissue, above which it is told
 SMOOTHED = 1.0  # mean free paths over which the radiance at the border follows its curvature and creases
 
 
@@ -55,8 +56,8 @@ def solve(
     Parameters
     ----------
     mesh : tetrahedra of the tissue; `media[label]` fills its region `label`
-    media : absorption, reduced scattering and refractive index of each region; a line on stderr tells of a scattering
-        that no soft tissue has, as of numbers in 1/cm
+    media : absorption, reduced scattering and refractive index of each region; lines on stderr tell of a scattering
+        that no soft tissue has, as of numbers in 1/cm, and of an index that changes inside the tissue
     sources : at least one; their shapes must lie inside the mesh
     model : "sp3" or "diffusion"
     a : boundary factor A of diffusion: 'robin' or 'haskell' (from the n of each region, see `optics.boundary`), or a
@@ -73,7 +74,7 @@ def solve(
     report = progress or (lambda stage: None)
     report("assemble")
     tissue = Tissue(mesh, media, model=model, a=a, order=order)
-    if warning := scattering_warning(tissue.media):
+    for warning in tissue.warnings():
         LOG.warning("fspt: solve: %s", warning)
     report("solve")
     return tissue.solve(sources)
@@ -122,6 +123,21 @@ class Tissue:
         if repeated:
             self._coarse = (self.linear if model == "diffusion" else self._of_order_1(model)).system
         self.system: System = System(self.elements, self.equations, self._shape, self._coarse)
+
+    def warnings(self) -> list[str]:
+        """Lines on a scattering that no soft tissue has, and on the largest change of n inside the tissue."""
+        scattering = scattering_warning(self.media)
+        lines = [scattering] if scattering else []
+        n = np.array([medium.n for medium in self.media])[self.mesh.region]
+        change = np.where(self.mesh.neighbours < 0, 1.0, n[self.mesh.neighbours] / n[:, None])
+        cell, side = np.unravel_index(np.argmax(change), change.shape)
+        if change[cell, side] > 1 + SAME_INDEX:
+            lines.append(
+                f"'n' changes from {n[cell]:g} to {n[self.mesh.neighbours[cell, side]]:g} inside the tissue, where it "
+                "neither reflects nor refracts here: only the n at the surface counts. Light that crosses such a "
+                "border is wrong, by some 10 % from 1 to 1.37."
+            )
+        return lines
 
     @cached_property
     def border_shape(self) -> BorderShape:

@@ -342,6 +342,19 @@ def test_coefficients_in_1_cm_are_told(musp: float, told: int, caplog: pytest.Lo
     assert caplog.text.count("in 1/cm, give a tenth of each, 'musp' = 0.91") == told
 
 
+@pytest.mark.parametrize(("n", "told"), [(1.0, 1), (1.38, 0)])
+def test_an_index_that_changes_inside_is_told(n: float, told: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Rationale: φ/n² is continuous at a border inside, which lets 0.1172 W leave in place of 0.1011 W where a sphere
+    of 6 mm with n = 1 is in one of 10 mm with 1.37. Seen to fail: left out without a word.
+    """
+    mesh = ball_mesh(10, 1)
+    mesh = Tetrahedra(mesh.vertices, mesh.cells, mesh.inside(Sphere((0.0, 0.0, 0.0), 6)), mesh.snap)
+    assert 0 < mesh.region.sum() < len(mesh.cells)
+    with caplog.at_level(logging.WARNING, "mitsuba_fspt"):
+        solve(mesh, [Medium(0.05, 1.0, 1.37), Medium(0.05, 1.0, n)], [Source(Sphere((0.0, 0.0, 0.0)))], order=1)
+    assert caplog.text.count("solve: 'n' changes from 1 to 1.37 inside the tissue") == told
+
+
 def test_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finite_elements, "MOST_ITERATIONS", 3)
     with pytest.raises(FluxError, match="did not converge in 3 iterations"):
