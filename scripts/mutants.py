@@ -664,8 +664,8 @@ MUTANTS = (
     Mutant(
         "transpose of the matrix",
         "inverse/transport_matrix.py",
-        'parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)',
-        'parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)[::-1]',
+        'parts = _finite("images", np.asanyarray(x, np.float64)).reshape(len(self.views), -1)',
+        'parts = _finite("images", np.asanyarray(x, np.float64)).reshape(len(self.views), -1)[::-1]',
         ("tests/inverse/test_transport_matrix.py", "tests/inverse/test_transport.py"),
     ),
     Mutant(

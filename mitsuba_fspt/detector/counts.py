@@ -29,7 +29,7 @@ from ..images.frame_file import (
 )
 from ..images.tiff_pages import channels_of, read_oriented
 from ..runtime.errors import BackendError, DetectorError, ImageError
-from ..runtime.numbers import whole
+from ..runtime.numbers import require_unmasked, whole
 
 Frame = ArrayLike | str | os.PathLike[str]
 LOG = logging.getLogger("mitsuba_fspt")
@@ -251,6 +251,7 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
         frames = whole("reduce: 'frames'", frames, ImageError, "10")
         if frames < 1:
             raise ImageError(f"reduce: 'frames' must be >= 1, got {frames}. Give for example 10.")
+    require_unmasked(f"counts '{name}'", array, ImageError, "Give its data, and its mask as 'bad_pixels'.")
     array = np.asarray(array)
     colour = array.ndim == 3 and array.shape[2] in (3, 4)  # the last axis of RGB and RGBA files
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0 or colour:

@@ -63,12 +63,12 @@ class Image(ImageData):
     dark_noise : array, shape (h, w), >= 0 [e-]: standard deviation of a pixel without light, of an image whose
         detector has another one on each pixel; None: `read_noise` and `dark_electrons` of the metadata, if it has them
 
-    The arrays are stored as read-only views with at least 32-bit floats.
+    The arrays are stored as read-only copies with at least 32-bit floats. What a masked array of NumPy hides is masked.
 
     Raises
     ------
-    ImageError : an array is not of shape (h, w), the shapes differ, a value is NaN or infinite, or the
-        metadata name another quantity or unit than power in W.
+    ImageError : an array is not of shape (h, w), the shapes differ, a value is NaN or infinite, an error negative, an
+        array of xarray not upright, or the metadata name another quantity or unit than power in W.
     """
 
     def __repr__(self) -> str:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..runtime.errors import ImageError
+from ..runtime.errors import FsptError, ImageError
 from .formats import BESIDE, Metadata
 from .recorded_number import recorded_number
 
@@ -29,8 +29,7 @@ class ImageData:
 
     def __post_init__(self) -> None:
         shape = np.shape(self.power)
-        if self.mask is not None:
-            object.__setattr__(self, "mask", _mask_plane(self.mask, shape))
+        masks = [] if self.mask is None else [_mask_plane(self.mask, shape)]
         for name in ("power", *(name for name in BESIDE if name != "mask")):
             values = getattr(self, name)
             if values is None and name != "power":
@@ -39,6 +38,11 @@ class ImageData:
             if plane.shape != shape:
                 raise ImageError(f"image: '{name}' must have the shape {shape} of 'power', got {plane.shape}. Crop it.")
             object.__setattr__(self, name, plane)
+            if np.ma.is_masked(values):
+                masks.append(np.ma.getmaskarray(values))
+        object.__setattr__(self, "mask", _own(np.logical_or.reduce(masks), bool) if masks else None)
+        if self.error is not None and not (self.error >= 0).all():
+            raise ImageError(f"image: 'error' must be >= 0, got {self.error.min():g}. Give an absolute error [W].")
         if self.flat is not None and not (self.flat > 0).all():
             raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
         for name in ("flat_error", "dark_noise"):
@@ -102,21 +106,23 @@ class ImageData:
 
 
 def _mask_plane(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """`values` as a read-only array of True and False of this shape; ImageError for anything else."""
+    """`values` as an array of True and False of this shape; ImageError for anything else."""
     array = np.asarray(values)
     if array.dtype != bool or array.shape != shape:
         raise ImageError(
             f"image: 'mask' must be True and False of the shape {shape} of 'power', got {array.dtype} of shape "
             f"{array.shape}. Give True for pixels to leave out."
         )
-    view = array.view()
-    view.flags.writeable = False
-    return view
+    return array
 
 
 def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
-    """`values` as a read-only array (h, w) of at least 32-bit floats; ImageError if shape, type or a value is wrong."""
-    array = np.asarray(values)
+    """`values` as a read-only array (h, w) of at least 32-bit floats; ImageError if shape, type or a value is wrong.
+
+    Where a masked array hides them, they are 1 in 'flat' and 0 in others.
+    """
+    require_upright(f"image: '{name}'", values, ImageError)
+    array = np.ma.filled(values, 1 if name == "flat" else 0)
     if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
         raise ImageError(
             f"image: '{name}' must be numbers of shape (h, w), got {array.dtype} of shape {array.shape}. "
@@ -129,6 +135,26 @@ def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
             f"image: '{name}' must be finite, got {array[row, column]} at row {row}, column {column} "
             f"({np.sum(~finite)} such pixels). Check the exitance."
         )
-    view = array.astype(np.result_type(array.dtype, np.float32), copy=False).view()
-    view.flags.writeable = False
-    return view
+    return _own(array, np.result_type(array.dtype, np.float32))
+
+
+def _own(array: NDArray, dtype: DTypeLike) -> NDArray:
+    """The values of an array, read-only: a copy, unless nobody can write into the array itself."""
+    if array.dtype == dtype and array.base is None and not array.flags.writeable:
+        return array
+    own = np.array(array, dtype)
+    own.flags.writeable = False
+    return own
+
+
+def require_upright(thing: str, values: object, error: type[FsptError]) -> None:
+    """Raise `error` for an array of xarray whose x is first, or whose y in mm begins at the bottom."""
+    dimensions, coordinates = getattr(values, "dims", ()), getattr(values, "coords", {})
+    if dimensions == ("x", "y"):
+        raise error(f"{thing} has the dimensions (x, y). Give .transpose('y', 'x').")
+    for axis, descends in (("y", True), ("x", False)) if dimensions == ("y", "x") else ():
+        place = coordinates.get(axis)
+        if place is None or place.attrs.get("units") != "mm" or len(place) < 2 or (place[0] > place[-1]) == descends:
+            continue
+        order = "descend, as row 0 is the top" if descends else "ascend"
+        raise error(f"{thing} has {axis} [mm] that must {order}. Give .sortby('{axis}', {not descends}).")

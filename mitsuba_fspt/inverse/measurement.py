@@ -20,7 +20,7 @@ from ..images.exposure import Exposure
 from ..images.image import Image
 from ..images.noise_model import NoiseModel, is_known, response_of
 from ..runtime.errors import ImageError, InversionError
-from ..runtime.numbers import number
+from ..runtime.numbers import number, stacked
 from .band_light import light_of_images
 from .common_noise import CommonNoise, squared_correlations
 from .stray_matrix import stray_light_of, without_glare_of
@@ -208,7 +208,7 @@ class Measurement:
         """
         if isinstance(images, (Image, Exposure, str, os.PathLike)):
             images = [images]
-        if isinstance(images, np.ma.MaskedArray):
+        if isinstance(images := stacked(images), np.ma.MaskedArray):
             mask = np.ma.getmaskarray(images) | (False if mask is None else np.asarray(mask))
             images = images.filled(0)
         listed = isinstance(images, (list, tuple))

@@ -17,11 +17,13 @@ from scipy.sparse.linalg import LinearOperator
 
 from ..detector.stray_light import StrayLight
 from ..images.image import Image
+from ..images.image_data import require_upright
 from ..images.pixel_axes import CROP
 from ..images.recorded_number import recorded_number, recorded_positive
 from ..integral.rows.sparse_rows import SparseRows
 from ..rendering.provenance import same_mesh
 from ..runtime.errors import DetectorError, TransportError
+from ..runtime.numbers import require_unmasked
 from .band_light import light_notes
 from .stray_rows import spread_rows
 from .transport_file import contents, write
@@ -73,6 +75,8 @@ class TransportMatrix(LinearOperator):
         self.on = str(self.metadata["on"])
         self.parts = {name: slice(*ends) for name, ends in self.metadata["parts"].items()}
         self.areas, self.sensitivity = areas, sensitivity
+        for array in (areas, sensitivity):
+            array.flags.writeable = False  # results follow from them
         self.blocks = blocks
         views, height, width = self.image_shape
         super().__init__(np.dtype(np.float64), (views * height * width, len(areas)))
@@ -119,6 +123,9 @@ class TransportMatrix(LinearOperator):
             images = [images]
         if isinstance(images, (list, tuple)) and any(isinstance(image, Image) for image in images):
             self._check_images(images)
+        for image in images if isinstance(images, (list, tuple)) else [images]:
+            require_unmasked("transport: images", image, TransportError, "Fill it, for example with zeros.")
+            require_upright("transport: an image", image, TransportError)
         try:
             power = np.asarray(
                 [np.asarray(i, np.float64) for i in images] if isinstance(images, (list, tuple)) else images
@@ -155,7 +162,7 @@ class TransportMatrix(LinearOperator):
     def _exitance(self, exitance: ArrayLike) -> Array:
         """J_n as an array (n,) of finite numbers; TransportError for anything else."""
         try:
-            given = np.asarray(exitance, dtype=np.float64)
+            given = np.asanyarray(exitance, dtype=np.float64)
         except (TypeError, ValueError) as cause:
             raise TransportError(f"transport: J must be numbers of shape ({self.shape[1]},): {cause}.") from cause
         if given.shape != (self.shape[1],):
@@ -173,7 +180,7 @@ class TransportMatrix(LinearOperator):
         return np.concatenate([block.matrix @ x for block in self.blocks])
 
     def _rmatvec(self, x: Array) -> Array:
-        parts = np.asarray(_finite("images", np.asarray(x, np.float64))).reshape(len(self.views), -1)
+        parts = _finite("images", np.asanyarray(x, np.float64)).reshape(len(self.views), -1)
         total = np.zeros(self.shape[1])
         for block, part in zip(self.blocks, parts, strict=True):
             total += block.matrix.T @ part
@@ -300,7 +307,7 @@ class StrayMatrix(TransportMatrix):
 
     def _finite_images(self, x: Array) -> Array:
         """A vector of all pixels as images (views, height, width); TransportError for values that are not finite."""
-        return self.images(np.asarray(x, np.float64).reshape(self.image_shape))
+        return self.images(np.asanyarray(x, np.float64).reshape(self.image_shape))
 
     def _spread(self, images: Array) -> Array:
         return np.stack([spread.forward(image) for spread, image in zip(self.spreads, images, strict=True)])
@@ -326,12 +333,14 @@ def read_transport(path: str | os.PathLike[str]) -> TransportMatrix:
 
 
 def _finite(name: str, values: Array) -> Array:
+    """`values` as a plain array; TransportError if one is NaN, infinite or under a mask."""
+    require_unmasked(f"transport: {name}", values, TransportError, "Fill it, for example with zeros.")
     finite = np.isfinite(values)
     if not finite.all():
         raise TransportError(
             f"transport: {name} has {int(np.sum(~finite))} values that are NaN or infinite. Replace or mask them first."
         )
-    return values
+    return np.asarray(values)
 
 
 def _differences(

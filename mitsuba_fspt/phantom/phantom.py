@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.errors import ExitanceError, FluxError
+from ..runtime.numbers import require_unmasked
 from .formats.ply import attribute_name, read_ply, write_ply
 from .formats.raw import Field, RawMesh
 from .surface_mesh import Closure, Indices, Points, closure, face_areas
@@ -76,7 +77,8 @@ class Phantom:
 
     def __post_init__(self) -> None:
         for name, kind in (("vertices", np.float64), ("faces", np.int64), ("exitance", np.float64)):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
+            require_unmasked(f"phantom: '{name}'", getattr(self, name), FluxError, "Fill it, for example with zeros.")
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=kind))
         if self.per not in ("vertex", "face"):
             raise FluxError(f"phantom: 'per' must be vertex or face, got '{self.per}'.")
         count = len(self.vertices if self.per == "vertex" else self.faces)

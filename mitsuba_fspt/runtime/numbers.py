@@ -6,6 +6,7 @@ import math
 from contextlib import suppress
 from decimal import Decimal
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,20 @@ def whole(thing: str, value: object, error: type[FsptError], example: str) -> in
             if found == value:
                 return found
     raise error(f"{thing} must be a whole number, got {_shown(value)}. Give for example {example}.")
+
+
+def require_unmasked(thing: str, values: object, error: type[FsptError], fix: str) -> None:
+    """Raise `error` for a masked array that hides values: as a plain array it would show what is under its mask."""
+    if np.ma.is_masked(values):
+        raise error(f"{thing} is a masked array that hides {np.ma.count_masked(values)} values. {fix}")
+
+
+def stacked(values: Any) -> Any:
+    """A list of arrays of one shape of which some hide values as one masked array; anything else unchanged."""
+    if not isinstance(values, (list, tuple)) or not all(isinstance(value, np.ndarray) for value in values):
+        return values
+    alike = len({value.shape for value in values}) == 1
+    return np.ma.stack(values) if alike and any(map(np.ma.is_masked, values)) else values
 
 
 def _without_axes(value: object) -> object:

@@ -12,7 +12,7 @@ import pytest
 from small_scenes import camera_scene, disk
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.detector.counts import Counts, read_counts
+from mitsuba_fspt.detector.counts import Counts, counts_of, read_counts
 from mitsuba_fspt.detector.detector import Detector
 from mitsuba_fspt.detector.reduction import Corrections, Exposed, calibrated, read_measured, reduce_counts, reduced
 from mitsuba_fspt.images.comparison import compare
@@ -547,6 +547,13 @@ def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):
                 read_counts(tmp_path / "b.fits")
         else:
             assert read_counts(tmp_path / "b.fits").raw
+
+
+def test_masked_counts_are_refused():
+    """Seen to fail: what the mask hides counted."""
+    counts = np.ma.masked_greater(np.arange(12.0).reshape(3, 4), 9)
+    with pytest.raises(ImageError, match=r"masked array that hides 2 values\. Give its data, and its mask as 'bad_pix"):
+        counts_of(counts, "counts")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".fits"])

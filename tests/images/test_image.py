@@ -114,11 +114,40 @@ def test_a_small_source_does_not_lose_digits():
 
 
 def test_images_cannot_be_written_into():
+    """Also not by the caller's own array, such as a buffer of frames. Seen to fail: an image of 3 W in place of 1 W."""
     values = np.ones((2, 2))
     image = Image(values)
+    assert Image(image.power).power is image.power
     with pytest.raises(ValueError, match="read-only"):
         image.power[0, 0] = 2
     values[0, 0] = 3  # the caller's own array stays the caller's
+    assert image.power.tolist() == [[1, 1], [1, 1]]
+
+
+def test_what_a_masked_array_hides_is_masked():
+    """Seen to fail: numbers under the mask counted in the total, NaN there was refused."""
+    power = np.ma.array([[1.0, 2.0], [np.nan, 100.0]], mask=[[False, False], [True, True]])
+    image = Image(power, np.ma.array(np.ones((2, 2)), mask=[[True, False], [False, False]]))
+    assert image.mask.tolist() == [[True, False], [True, True]]
+    assert image.total_power == 2
+    assert Image(np.ma.array(np.ones((2, 2)))).mask is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda array: array.T, r"the dimensions \(x, y\)\. Give \.transpose\('y', 'x'\)"),
+        (lambda array: array.sortby("y"), r"has y \[mm\] that must descend.*Give \.sortby\('y', False\)"),
+        (lambda array: array.sortby("x", False), r"has x \[mm\] that must ascend.*Give \.sortby\('x', True\)"),
+    ],
+)
+def test_an_array_of_xarray_must_be_upright(change, message):
+    """Seen to fail: the image lay on its side, or stood on its head, without a word."""
+    pytest.importorskip("xarray")
+    array = Image(np.arange(9.0).reshape(3, 3), metadata={"pixel_pitch": 0.1}).to_xarray().power
+    np.testing.assert_array_equal(Image(array).power, array)
+    with pytest.raises(ImageError, match=message):
+        Image(change(array))
 
 
 @pytest.mark.parametrize(
@@ -135,6 +164,7 @@ def test_images_cannot_be_written_into():
             {"power": np.ones((2, 2)), "error": [[1, 1], [np.inf, 1]]},
             "'error' must be finite, got inf at row 1",
         ),
+        ({"power": np.ones((2, 2)), "error": [[1, 1], [-1, 1]]}, "'error' must be >= 0, got -1"),
         ({"power": np.ones((2, 2)), "coverage": np.ones((2, 3))}, r"'coverage' must have the shape \(2, 2\)"),
         ({"power": np.ones((2, 2)), "metadata": {"unit": "e-"}}, "values are power in e-, not power in W"),
     ],

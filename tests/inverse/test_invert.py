@@ -203,6 +203,8 @@ def test_masked_pixels_do_not_count(case):
     error = np.full(matrix.image_shape, 0.01 * max(i.power.max() for i in images))
     one, other = fspt.invert(matrix, hidden, error=error), fspt.invert(matrix, hidden.data, error=error, mask=mask)
     np.testing.assert_array_equal(one.exitance, other.exitance)
+    listed = fspt.invert(matrix, list(hidden), error=error)  # seen to fail: what the masks hide counted
+    np.testing.assert_array_equal(listed.exitance, other.exitance)
     mask = np.zeros(matrix.image_shape, bool)
     mask[1:] = True
     front = fspt.invert(matrix, images, mask=mask, **options)

@@ -321,7 +321,21 @@ def test_a_digest_of_a_mesh_does_not_depend_on_its_pose():
     assert not same_mesh(plain, mesh_digest(BODY.vertices, BODY.faces[::-1]))
 
 
+def test_areas_cannot_be_written_into(matrix):
+    """Seen to fail: `weights = T.areas; weights *= …` changed the powers of all later results."""
+    for array in (matrix.areas, matrix.sensitivity):
+        with pytest.raises(ValueError, match="read-only"):
+            array *= 2
+
+
 def test_vectors_that_do_not_fit_are_refused(matrix):
+    """Masked arrays, too. Seen to fail: `T @ J` and `backward` took what the mask hides."""
+    hidden = np.ma.array(np.ones(162), mask=np.arange(162) == 3)
+    for product in (matrix.forward, matrix.matvec):
+        with pytest.raises(TransportError, match=r"J is a masked array that hides 1 values\. Fill it"):
+            product(hidden)
+    with pytest.raises(TransportError, match="images is a masked array that hides 504 values"):
+        matrix.backward(np.ma.masked_all(matrix.image_shape))
     with pytest.raises(TransportError, match=r"J must have the shape \(162,\)"):
         matrix.forward(np.ones(161))
     with pytest.raises(TransportError, match="J has 1 values that are NaN"):

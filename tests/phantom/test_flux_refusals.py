@@ -101,6 +101,13 @@ def test_mmc_files(tmp_path, files, message):
     assert "\n" not in str(caught.value)
 
 
+def test_masked_values_are_refused():
+    """Seen to fail: what the mask hides counted."""
+    values = np.ma.masked_greater([1.0, 1.0, 1.0, 9.0], 2)
+    with pytest.raises(FluxError, match=r"'values' is a masked array that hides 1 values\. Fill it"):
+        import_flux((POINTS, ELEMENT), values, per="vertex")
+
+
 def test_mmc_options(tmp_path):
     mesh, values = mmc(tmp_path)
     assert import_flux(mesh, values).power == pytest.approx(0.4)

@@ -101,6 +101,7 @@ def test_power_of_a_sphere():
     [
         ({"exitance": np.ones(5)}, FluxError, r"must fit, got shapes \(42, 3\), \(80, 3\) and \(5,\)"),
         ({"exitance": np.full(42, np.nan)}, ExitanceError, r"42 of 42 values are NaN or inf"),
+        ({"exitance": np.ma.masked_all(42)}, FluxError, "'exitance' is a masked array that hides 42 values. Fill it"),
         ({"exitance": np.full(42, -1.0)}, ExitanceError, r"must be >= 0, the least is -1 W/mm\^2"),
         ({"per": "edge"}, FluxError, r"'per' must be vertex or face, got 'edge'"),
         ({"faces": FACES + 1}, FluxError, r"numbers of the 42 vertices"),
@@ -113,6 +114,14 @@ def test_power_of_a_sphere():
 def test_invalid_phantoms(changes, error, message):
     with pytest.raises(error, match=message):
         phantom(**changes)
+
+
+def test_arrays_of_a_phantom_are_its_own():
+    """Seen to fail: 0 W after the caller used an array again."""
+    exitance = np.ones(42)
+    found = phantom(exitance=exitance)
+    exitance[:] = 0
+    assert found.power == pytest.approx(found.area)
 
 
 @pytest.mark.parametrize("name", ["p.obj", "missing/p.ply"])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...runtime.errors import FluxError
+from ...runtime.numbers import require_unmasked
 from .meshio_files import FORMATS as MESHIO
 from .meshio_files import read_meshio
 from .mmc import mmc_mesh, read_mmc
@@ -120,6 +121,7 @@ def _with_values(raw: RawMesh, values: ValuesLike, field: str | None) -> RawMesh
             places = raw.points, raw.points[raw.cells].mean(axis=1)
             name, (array, label) = Path(values).name, labelled_values(Path(values), field, places)
     else:
+        require_unmasked("flux import: 'values'", values, FluxError, "Fill it, for example with zeros.")
         name, array, label = "values", column(np.asarray(values), [], field, "values"), ""
     source = f"{raw.source} with {name}" + (f" '{field}'" if field else "")
     stated = {key: text for key, text in raw.stated.items() if key in (LENGTH_UNIT, UP)}
