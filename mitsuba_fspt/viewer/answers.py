@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..images.image import Image
-from ..images.pixel_axes import virtual_pitch
+from ..images.pixel_axes import PixelAxes
 from ..images.radiometry import etendue, surface_ratio
 from ..optics.light import PLANCK_TIMES_LIGHT, Light
 from ..optics.models import model_names
@@ -158,6 +158,7 @@ class Answers:
                 lacks = _one_line(error)
         height, width = image.shape
         light = Light.recorded(known, ImageError, "view")
+        axes = PixelAxes.of(image.shape, known)
         record = given | {
             "kind": "picture",
             "height": height,
@@ -166,7 +167,8 @@ class Answers:
             "lacks": lacks,
             "rtol": known.get("rtol"),
             "method": known.get("method"),
-            "side": virtual_pitch(known),
+            "side": axes.side,
+            "corner": [float(axes.x[0]), float(axes.y[0])],
             "wavelength_nm": light.mean_wavelength_nm if light else None,
             "surface_ratio": surface_ratio(known, light) if light else 1.0,
             "photons_per_joule_nm": 1e-9 / PLANCK_TIMES_LIGHT,

@@ -219,17 +219,24 @@ WIDGET = """async (address) => {
     const slider = { name: "f_number", value: 4, low: 1, high: 32, step: 0.06, scale: "stops", unit: "", lens: true };
     found.take({ kind: "hello", scene: "box", sliders: [slider], models: [] }, []);
     const record = { kind: "picture", slot: "a", number: sent.at(-1).number, fine: true, width: 1, height: 1,
-        planes: ["power", "error", "coverage"], side: 0.5, photons_per_joule_nm: 1, warnings: "", lens: {} };
+        planes: ["power", "error", "coverage"], side: 0.5, corner: [2.5, -1], photons_per_joule_nm: 1, warnings: "",
+        lens: {} };
     const view = new DataView(new Float32Array([3, 0, 1]).buffer);
     found.take(record, [view]);
     await new Promise((done) => setTimeout(done, 200));
-    return [sent.map((one) => one.kind), root.querySelector("figcaption").textContent];
+    root.querySelector("canvas[data-panel=a]").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" }));
+    const texts = ["figcaption", ".readout .head"].map((name) => root.querySelector(name).textContent);
+    return [sent.map((one) => one.kind), ...texts];
 }"""
 
 
 def test_the_module_is_a_widget_too(page, served):
-    """anywidget calls `render` with a model that carries messages, planes as DataViews."""
-    kinds, caption = page.evaluate(WIDGET, served[1])
+    """anywidget calls `render` with a model that carries messages, planes as DataViews.
+
+    The one pixel is that of a crop window. Seen to fail: at x 0 mm, y 0 mm.
+    """
+    kinds, caption, place = page.evaluate(WIDGET, served[1])
+    assert place == "Column 0, row 0 (x 2.5 mm, y -1 mm)"
     assert kinds == ["hello", "picture", "picture"]
     assert "total 3 ± " in caption
 

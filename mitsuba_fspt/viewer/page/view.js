@@ -180,7 +180,7 @@ class Picture {
   /** Middle of a pixel [mm] on the virtual detector plane, x to the right and y up; null if its side is unknown. */
   place(column, row) {
     if (!this.side) return null;
-    return [(column + 0.5 - this.width / 2) * this.side, (this.height / 2 - row - 0.5) * this.side];
+    return [this.corner[0] + column * this.side, this.corner[1] - row * this.side];
   }
 }
 
@@ -957,9 +957,9 @@ class View {
     const first = tall - bottom + 11, second = first + 15; // lines of the numbers below the axis
     for (const k of ticks(0, count - 1, false).filter(Number.isInteger)) context.fillText(String(k), x(k), first);
     if (side) {
-      const half = (count * side) / 2;
-      const place = (mm) => edge((along === "row" ? half + mm : half - mm) / side);
-      for (const mm of ticks(-half, half, false)) {
+      const [start, end] = [-0.5, count - 0.5].map((k) => this.pictures.a.place(k, k));
+      const place = (mm) => edge((along === "row" ? mm - start[0] : start[1] - mm) / side);
+      for (const mm of along === "row" ? ticks(start[0], end[0], false) : ticks(end[1], start[1], false)) {
         context.fillRect(place(mm), tall - bottom, 1, 4);
         context.fillText(digits(mm, 3), place(mm), second);
       }
