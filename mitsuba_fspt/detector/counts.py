@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..images.exposure import Exposure
 from ..images.formats import read_planes
 from ..images.frame_file import (
     FIRST,
@@ -27,6 +28,7 @@ from ..images.frame_file import (
     tell_open_rows,
     tiff_row,
 )
+from ..images.image import Image
 from ..images.tiff_pages import channels_of, read_oriented
 from ..runtime.errors import BackendError, DetectorError, ImageError
 from ..runtime.numbers import require_unmasked, whole
@@ -244,13 +246,19 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
 
     Raises
     ------
-    ImageError : the array is none of these, holds NaN, has another number of frames, or its last axis seems to be that
-        of the frames: the two others are more alike. `frames` says that it is not.
+    ImageError : the array is none of these, or an image of this package, holds NaN, has another number of frames, or
+        its last axis seems to be that of the frames: the two others are more alike. `frames` says that it is not.
     """
     if frames is not None:
         frames = whole("reduce: 'frames'", frames, ImageError, "10")
         if frames < 1:
             raise ImageError(f"reduce: 'frames' must be >= 1, got {frames}. Give for example 10.")
+    for one in array if isinstance(array, (list, tuple)) else (array,):
+        if isinstance(one, (Image, Exposure)):
+            raise ImageError(
+                f"counts '{name}' are an {type(one).__name__}, of power or electrons. Give counts, as exposure.counts; "
+                "'invert' and 'locate' take such an image as it is."
+            )
     require_unmasked(f"counts '{name}'", array, ImageError, "Give its data, and its mask as 'bad_pixels'.")
     array = np.asarray(array)
     colour = array.ndim == 3 and array.shape[2] in (3, 4)  # the last axis of RGB and RGBA files

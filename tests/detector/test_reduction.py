@@ -549,6 +549,15 @@ def test_blank_pixels_of_unsigned_counts_are_refused(tmp_path):
             assert read_counts(tmp_path / "b.fits").raw
 
 
+@pytest.mark.parametrize("given", [lambda e: e, lambda e: [e, e], lambda e: ramp()])
+def test_an_image_in_memory_is_no_counts(given):
+    """As its file is none. Seen to fail: electrons were taken for DN, without their bias and gain."""
+    exposure = CCD.expose(ramp(), 60, 650, seed=1)
+    assert CCD.reduce(exposure.counts, exposure_time=60, wavelength_nm=650).power.max() > 0
+    with pytest.raises(ImageError, match=r"'counts' are an (Exposure|Image), of power or electrons\. Give counts"):
+        CCD.reduce(given(exposure), exposure_time=60, wavelength_nm=650)
+
+
 def test_masked_counts_are_refused():
     """Seen to fail: what the mask hides counted."""
     counts = np.ma.masked_greater(np.arange(12.0).reshape(3, 4), 9)
