@@ -12,6 +12,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Sequence
+from threading import RLock
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,7 @@ INSTALL = (
     f"Or set {libllvm.ENVIRONMENT_NAME} to the library's file before Python starts."
 )
 SUPPORTED = ("llvm_", "cuda_")  # beginnings of the variants' names
+_loading = RLock()  # a second thread would see a Mitsuba that is half loaded
 
 
 class ImportWatch:
@@ -138,13 +140,14 @@ def ensure_variant() -> str:
     ------
     BackendError : the active variant is none of LLVM and CUDA, its LLVM does not work, or no backend works.
     """
-    import mitsuba
+    with _loading:
+        import mitsuba
 
-    active: str | None = mitsuba.variant()
-    if active is None:
-        active = choose_variant()
-        mitsuba.set_variant(active)
-    elif not active.startswith(SUPPORTED):
+        active: str | None = mitsuba.variant()
+        if active is None:
+            active = choose_variant()
+            mitsuba.set_variant(active)
+    if not active.startswith(SUPPORTED):
         raise BackendError(
             f"the active variant {refusal(active)}"
             " Call mi.set_variant('llvm_ad_mono') or 'cuda_ad_mono' first, or set none."

@@ -66,6 +66,27 @@ print(json.dumps([loaded, before, mitsuba.variant(), plugins.seen]))
 
 
 @needs_llvm
+def test_threads_may_be_first_to_use_mitsuba() -> None:
+    """Seen to fail: "module 'mitsuba' has no attribute 'variant'" in all threads but one."""
+    script = """
+import threading
+from mitsuba_fspt.runtime import backend
+found, together = [], threading.Barrier(6)
+sys.setswitchinterval(1e-5)
+def work():
+    together.wait()
+    found.append(backend.ensure_variant())
+threads = [threading.Thread(target=work) for _ in range(6)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(json.dumps(found))
+"""
+    assert len(run_script(script)) == 6
+
+
+@needs_llvm
 @pytest.mark.parametrize("order", ["mitsuba_fspt, mitsuba", "mitsuba, mitsuba_fspt"])
 def test_plugins_register_after_every_switch_in_either_import_order(order: str) -> None:
     script = f"""
