@@ -8,6 +8,7 @@ pupil magnification P has f_x = F (1 + t/P)/p (Eq. M.41): the pixel pitch is p =
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from .thin_lens import Lens
 
 Array = NDArray[np.float64]
 TOLERANCE = 0.5  # pixels: largest shift of an image corner by properties of K that a lens with square pixels lacks
+LARGEST_TURN = 2 * math.pi  # rad; OpenCV's are at most half of it, but for rounding and for steps of a fit
 WIDEST = 3.0  # largest size, over that of the image, of a film with the principal point in the middle
 
 
@@ -162,7 +164,7 @@ def camera_from_opencv(
     """
     width, height = _size(width, height)
     matrix, magnified = _matrix(K), _pupil_magnification(pupil_magnification)
-    turn, shift = _numbers("rvec", rvec, (3,)), _numbers("tvec", tvec, (3,))
+    turn, shift = _turn(rvec), _numbers("tvec", tvec, (3,))
     with named("camera_from_opencv"):
         bent = None if distortion is None else Distortion.of(distortion)
     focal = float(matrix[0, 0] + matrix[1, 1]) / 2
@@ -232,6 +234,17 @@ def _film(centre: float, size: int) -> tuple[int, int, float]:
         )
     more = round(off)
     return max(0, -more), size + abs(more), (off - more) / 2
+
+
+def _turn(rvec: ArrayLike) -> Array:
+    """Rotation vector (3,) [rad]; OpticsError where it is longer than a turn, as one in degrees."""
+    turn = _numbers("rvec", rvec, (3,))
+    if (angle := float(np.linalg.norm(turn))) > LARGEST_TURN:
+        raise OpticsError(
+            f"camera_from_opencv: 'rvec' must be a turn of at most 2 pi rad, its length is {angle:.4g}. Give radians; "
+            f"in degrees it would be {math.radians(angle):.4g} rad."
+        )
+    return turn
 
 
 def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

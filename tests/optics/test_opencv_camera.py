@@ -80,6 +80,9 @@ def test_camera_parameters_that_a_lens_lacks_are_reported():
         bad[place] = value
         with pytest.raises(OpticsError, match=words):
             fspt.camera_from_opencv(bad, RVEC, TVEC, width=WIDTH, height=HEIGHT)
+    degrees = "'rvec' must be a turn of at most 2 pi rad, its length is 90.*in degrees it would be 1.571 rad"
+    with pytest.raises(OpticsError, match=degrees):  # seen to fail: 90 rad, another pose, without a word
+        fspt.camera_from_opencv(K, [0, 90, 0], TVEC, width=WIDTH, height=HEIGHT)
     with pytest.raises(OpticsError, match="'rvec' must be"):
         fspt.camera_from_opencv(K, [1, 2], TVEC, width=WIDTH, height=HEIGHT)
     with pytest.raises(OpticsError, match="sets no focus"):
