@@ -6,6 +6,7 @@ a slow moment of the machine affects all methods alike.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import platform
@@ -14,14 +15,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.image import read
+from ..images.image import Image, read
 from ..integral.quadrature import Quadrature
 from ..rendering import render
 from ..rendering.scene import loaded
@@ -36,11 +37,15 @@ if TYPE_CHECKING:
 
     from ..runtime.progress_bar import Progress
 
+LOG = logging.getLogger("mitsuba_fspt")
 BUDGET, ROUNDS = 2.0, 5
 REFERENCE_TIME = 15.0  # times the budget: run time of the reference image
 PATIENCE = 4.0  # times the budget: longest time of a method's coarsest setting
 BURST = 0.1  # s: least total time of a setting's repeated runs in one round
 WHOLE_CONE = 1 - 1e-4  # least coverage of a pixel whose lines of sight all meet the phantom; float32 sums are rounded
+# RMS difference between a given reference and the integral, beyond the integral's error and so many of the reference's,
+# which may be standard errors, over the peak, from which on the reference is told to be of another image.
+APART, DEVIATIONS = 0.01, 4.0
 MIB = 1 << 20
 CACHE_VARIABLE = "DRJIT_CACHE_DIR"  # environment variable that names Dr.Jit's folder of compiled kernels
 # The reference always takes the first rtol, and a finer one if its expected time is within REFERENCE_TIME.
@@ -104,7 +109,10 @@ def converge(
     lens = render.sensor_of(scene, sensor)
     report = progress or (lambda what, share: None)
     measured_from = _reference(scene, lens, reference, budget, report)
-    full = np.asarray(render.render(scene, method="integral", sensor=sensor, rtol=1e-3).coverage) > WHOLE_CONE
+    image = render.render(scene, method="integral", sensor=sensor, rtol=1e-3)
+    full = np.asarray(image.coverage) > WHOLE_CONE
+    if reference is not None:
+        measured_from = _checked(measured_from, image)
     benchmark = Benchmark(measured_from, full, Path(kernels) if kernels is not None else None, budget)
     skipped = benchmark.try_all(*methods(scene, lens, measured_from.least_rtol), report)
     rate = benchmark.run_rounds(rounds, [raw_rate(scene, lens, together) for together in (False, True)], report)
@@ -208,6 +216,25 @@ def _reference(
     from_file = read_reference(path, shape) if path is not None else None
     report("reference", 0.0)
     return from_file or own_reference(scene, lens, REFERENCE_TIME * budget)
+
+
+def _checked(reference: Reference, image: Image) -> Reference:
+    """The reference of a file; if the integral's image is another one, `check` and a line on stderr say so."""
+    known = np.asarray(image.error) + DEVIATIONS * reference.error
+    apart = np.maximum(np.abs(image.power - reference.power) - known, 0)
+    rms = float(np.sqrt(np.mean(apart**2)) / reference.peak)
+    if rms <= APART:
+        return reference
+    check = (
+        f"the integral's image is another one: RMS difference beyond both errors {rms:.1e} of the peak, "
+        f"{image.total_power / reference.power.sum():.4g} of the reference's power"
+    )
+    LOG.warning(
+        "fspt: converge: reference '%s': %s. Give one of the same parameters and power of the source.",
+        reference.name,
+        check,
+    )
+    return replace(reference, check=check)
 
 
 def _shape(scene: mi.Scene, lens: mi.Sensor) -> tuple[int, int]:

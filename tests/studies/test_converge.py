@@ -284,6 +284,18 @@ def test_reference_from_a_file(tmp_path):
         assert read.rms == pytest.approx(0.01 / math.sqrt(2))
 
 
+def test_a_reference_of_another_image_is_told(caplog):
+    """Such as one in W of a source of 1e-9 W. Seen to fail: no setting reached an error, and no word why."""
+    power = np.array([[1.0, 4.0]])
+    image = fspt.Image(power, power * 1e-3)
+    noisy = converge.Reference(power * [[1.2, 0.9]], power * 0.1, "noisy")
+    assert converge._checked(noisy, image) is noisy
+    assert caplog.text == ""
+    told = converge._checked(converge.Reference(power * 1e-9, power * 1e-12, "r.exr"), image)
+    assert "beyond both errors 7.3e+08 of the peak, 1e+09 of the reference's power" in told.check
+    assert "fspt: converge: reference 'r.exr': the integral's image is another one" in caplog.text
+
+
 @pytest.mark.parametrize("case", ["missing", "junk", "no error", "size", "dark", "nan", "text", "pickle"])
 def test_bad_reference_is_refused(tmp_path, case):
     path, one = tmp_path / "r.npz", np.ones((1, 2))
