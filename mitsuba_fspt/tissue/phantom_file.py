@@ -27,6 +27,7 @@ from .tetrahedra import Tetrahedra
 from .toml_table import Table
 
 ABSORBERS = ("blood", "water", "fat")  # keys of a band in place of mua; saturation goes with blood
+COARSER = 2.0  # edge of a file's tetrahedra over the one that is asked for, above which it is told
 VOLUME = 0.1  # relative error of a region's volume in the mesh, above which it is told
 LOG = logging.getLogger("mitsuba_fspt")
 SCATTERING = ("scattering", "scattering_power")  # keys in place of musp
@@ -71,15 +72,29 @@ class CylinderGeometry:
 
 @dataclass(frozen=True)
 class MeshGeometry:
-    """Tetrahedra or a closed surface in a file, in `length_unit` or its own; `labels`: field that labels its cells."""
+    """Tetrahedra or a closed surface in a file, in `length_unit` or its own; `labels`: field that labels its cells.
+
+    `edge_given` : the phantom file asks for the edge of the tetrahedra
+    """
 
     path: Path
     length_unit: str | None = None
     labels: str | None = None
+    edge_given: bool = False
 
     def mesh(self, edge: float) -> Tetrahedra:
-        """Tetrahedra of the file, or tetrahedra with edges of about `edge` [mm] that fill its surface."""
-        return read_tetrahedra(self.path, edge, self.length_unit, self.labels)
+        """Tetrahedra of the file, or tetrahedra with edges of about `edge` [mm] that fill its surface.
+
+        A line on stderr tells of tetrahedra in the file that are far coarser than the edge that is asked for.
+        """
+        mesh = read_tetrahedra(self.path, edge, self.length_unit, self.labels)
+        if self.edge_given and mesh.edge > COARSER * edge:
+            LOG.warning(
+                "fspt: geometry: '%s' holds tetrahedra with edges of %.3g mm, on which [mesh] edge = %g has no effect. "
+                "Give a file of finer ones, or of their surface.",
+                *(self.path, mesh.edge, edge),
+            )
+        return mesh
 
 
 @dataclass(frozen=True)
@@ -145,7 +160,7 @@ class PhantomFile:
         medium = _medium(optical, base)
         regions = tuple(_region(table, medium, spread) for table in file.tables("regions"))
         result = cls(
-            _geometry(file.table("geometry"), path.parent),
+            _geometry(file.table("geometry"), path.parent, "edge" in mesh.left),
             medium,
             tuple(_source(table) for table in file.tables("sources")),
             regions,
@@ -245,11 +260,11 @@ def _tell_volume(number: int, volume: float, exact: float, edge: float) -> None:
         )
 
 
-def _geometry(table: Table, folder: Path) -> CylinderGeometry | MeshGeometry:
-    """Geometry of the table [geometry]."""
+def _geometry(table: Table, folder: Path, edge_given: bool) -> CylinderGeometry | MeshGeometry:
+    """Geometry of the table [geometry]; `edge_given` as of `MeshGeometry`."""
     if "file" in table.left:
         result: CylinderGeometry | MeshGeometry = MeshGeometry(
-            folder / table.text("file"), table.optional_text("length_unit"), table.optional_text("labels")
+            folder / table.text("file"), table.optional_text("length_unit"), table.optional_text("labels"), edge_given
         )
     else:
         table.choice("shape", ("cylinder",))

@@ -269,6 +269,19 @@ def test_the_unit_of_a_mesh_is_checked(tmp_path: Path, caplog: pytest.LogCapture
     assert not caplog.messages  # metres, by the standard
 
 
+@pytest.mark.parametrize(("given", "told"), [("edge = 0.5", 1), ("edge = 2.5", 0), ("order = 1", 0)])
+def test_an_edge_that_tetrahedra_of_a_file_do_not_have_is_told(
+    given: str, told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Seen to fail: the edge had no effect, without a word."""
+    mesh = cylinder_tetrahedra(6, 8, 3)
+    np.savez(tmp_path / "tissue.npz", vertices=mesh.vertices, tetrahedra=mesh.cells)
+    text = '[geometry]\nfile = "tissue.npz"\n[optical]\nmua = 0.05\nmusp = 1.0\n'
+    (tmp_path / "p.toml").write_text(f"{text}[mesh]\n{given}\n")
+    assert PhantomFile.read(tmp_path / "p.toml").mesh().edge == pytest.approx(mesh.edge)
+    assert caplog.text.count("holds tetrahedra with edges of 3.24 mm, on which [mesh] edge = 0.5 has no effect") == told
+
+
 def test_the_border_of_tetrahedra_from_a_file_is_smooth(tmp_path: Path) -> None:
     """Rationale: tetrahedra of a sphere, a source in its middle: J_n is that of the sphere and equal everywhere.
 
