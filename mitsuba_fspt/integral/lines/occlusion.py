@@ -18,7 +18,8 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Start of a ray that leaves the surface: these shares of the largest coordinate and of the distance [mm/mm], some
 # hundred times the rounding of float32.
 CLEAR, CLEAR_OF_DISTANCE = 2.0**-16, 2.0**-20
-RESOLVED = 4e-7  # of the largest coordinate: height above a surface at which a ray does not meet it in float32
+RESOLVED = 4e-7  # of the largest coordinate: a ray that starts so high above a surface does not meet it by rounding
+PARALLEL = 0.99  # cosine of the angle between the normals of a surface and of one that a ray may meet by rounding
 
 
 def hidden(scene: mi.Scene, point: mi.Point3f, normal: mi.Normal3f, lens_point: mi.Point3f, active: mi.Bool) -> mi.Bool:
@@ -28,23 +29,40 @@ def hidden(scene: mi.Scene, point: mi.Point3f, normal: mi.Normal3f, lens_point: 
     Embree misses some points of a disk.
     """
     together = all(shape.is_mesh() for shape in scene.shapes())
-    return scene.ray_test(ray_to_lens(point, normal, lens_point), coherent=together, active=active)
+    ray = ray_to_lens(scene, point, normal, lens_point, active)
+    return scene.ray_test(ray, coherent=together, active=active)
 
 
-def ray_to_lens(point: mi.Point3f, normal: mi.Normal3f, lens_point: mi.Point3f) -> mi.Ray3f:
+def ray_to_lens(
+    scene: mi.Scene, point: mi.Point3f, normal: mi.Normal3f, lens_point: mi.Point3f, active: mi.Bool
+) -> mi.Ray3f:
     """Ray from a surface point that ends at a point of the lens.
 
-    It starts a little further along its own direction, and where it leaves the surface at a flat angle as far as it
-    takes to be above it. Mitsuba's `spawn_ray` would move the start along the normal by 9e-5 of the point's distance
-    from the origin, and with it the borders of shadows by a hundredth of a pixel.
+    It starts a little further along its own direction. Mitsuba's `spawn_ray` would move the start along the normal by
+    9e-5 of the point's distance from the origin, and with it the borders of shadows by a hundredth of a pixel.
+
+    Rounding lets a ray that leaves at a flat angle meet the surface that it leaves, as long as it is not `RESOLVED`
+    above. There it starts beyond any surface that it meets and that is parallel to its own.
     """
     way = mi.Vector3f(lens_point - point)
     distance = dr.norm(way)
     direction = way / distance
-    height = RESOLVED * dr.max(dr.abs(point), axis=0)
     clear = clear_of(point) + CLEAR_OF_DISTANCE * distance
     rise = dr.dot(normal, direction)
-    clear = dr.select(rise * distance > 2 * height, dr.maximum(clear, height / rise), clear)
+    resolved = RESOLVED * dr.max(dr.abs(point), axis=0)
+    above = dr.select(rise * distance > 2 * resolved, resolved / rise, 0)  # distance at which it is
+
+    def beyond(start: mi.Float, alive: mi.Bool) -> tuple[mi.Float, mi.Bool]:
+        ray = mi.Ray3f(point + start * direction, direction)
+        ray.maxt = above - start
+        pi = scene.ray_intersect_preliminary(ray, active=alive)
+        met = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active=alive)
+        own = alive & pi.is_valid() & (dr.abs(dr.dot(met.n, normal)) > PARALLEL)
+        start = dr.select(own, 2 * (start + pi.t), start)
+        return start, own & (start < above)
+
+    state = (clear, active & (clear < above))
+    clear = dr.while_loop(state, lambda start, alive: alive, beyond)[0]
     ray = mi.Ray3f(point + clear * direction, direction)
     ray.maxt = distance - clear
     return ray

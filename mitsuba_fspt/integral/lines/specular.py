@@ -254,7 +254,7 @@ def transmission(
     """
     if specular is None:
         return dr.select(hidden(scene, point, normal, lens_point, active), 0, mi.Float(1))
-    ray = ray_to_lens(point, normal, lens_point)
+    ray = ray_to_lens(scene, point, normal, lens_point, active)
     most = dr.opaque(mi.UInt32, specular.most)
 
     def surface(share: mi.Float, ray: mi.Ray3f, count: mi.UInt32, alive: mi.Bool) -> tuple:
