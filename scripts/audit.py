@@ -49,6 +49,7 @@ GOAL, LEAST_GOAL = 0.15, 1e-5  # error of the reference: over the stated error, 
 MATRIX_GOAL = 0.05  # likewise over rtol, for products of the matrix: in its scenes lines of sight cross many faces
 LEAST_TRUE = 1e-7  # of the brightest pixel: smaller errors are rounding
 WIDE = 0.1  # of rtol: least stated error of pixels for which stated over true error is evaluated
+SAME = ("rtol", "finer", "likely", "random")  # settings that the file does not tell
 FILLED = 0.9  # of the largest sum of a row of the matrix: with less, an edge may cross the pixel
 HEAD = (
     "scenes",
@@ -112,6 +113,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs"))
     parser.add_argument("--readme", type=Path, help="file whose table 'audit', or 'audit_matrix', is replaced")
     arguments = parser.parse_args()
+    if arguments.keep and (arguments.ablate or any(getattr(arguments, k) != parser.get_default(k) for k in SAME)):
+        parser.error(f"--keep goes with the default --{', --'.join(SAME)}, as of the rows that stay, and no --ablate")
     seeds = range(arguments.seed, arguments.seed + arguments.scenes)
     names = (
         arguments.family.split(",") if arguments.family else list(MESH_FAMILIES if arguments.matrix else ALL_FAMILIES)
@@ -140,7 +143,9 @@ def main() -> None:
 
 
 def _kept(path: Path, names: Sequence[str]) -> list[Audit]:
-    """Rows of a file but for those of families with these names."""
+    """Rows of a file, if there is one, but for those of families with these names."""
+    if not path.exists():
+        return []
     kinds = {"str": str, "int": int, "float": float}
     types = {field.name: kinds[str(field.type)] for field in fields(Audit)}
     with open(path, newline="") as file:

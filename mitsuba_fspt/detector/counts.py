@@ -256,10 +256,10 @@ def counts_of(array: Any, name: str, frames: int | None = None) -> Counts:
     for one in array if isinstance(array, (list, tuple)) else (array,):
         if isinstance(one, (Image, Exposure)):
             raise ImageError(
-                f"counts '{name}' are an {type(one).__name__}, of power or electrons. Give counts, as exposure.counts; "
-                "'invert' and 'locate' take such an image as it is."
+                f"reduce: '{name}' must be counts [DN], got an {type(one).__name__}, which holds watts or electrons. "
+                "Give the counts, such as exposure.counts; 'invert' and 'locate' take an Image or an Exposure."
             )
-    require_unmasked(f"counts '{name}'", array, ImageError, "Give its data, and its mask as 'bad_pixels'.")
+        require_unmasked(f"counts '{name}'", one, ImageError, "Give its data, and its mask as 'bad_pixels'.")
     array = np.asarray(array)
     colour = array.ndim == 3 and array.shape[2] in (3, 4)  # the last axis of RGB and RGBA files
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or array.size == 0 or colour:

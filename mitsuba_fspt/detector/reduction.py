@@ -33,7 +33,7 @@ from ..images.recorded_number import recorded_number, recorded_positive
 from ..optics.light import Light
 from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import BackendError, DetectorError, ImageError, named
-from ..runtime.numbers import number, whole
+from ..runtime.numbers import number, require_unmasked, whole
 from .counts import (
     CLICK,
     Counts,
@@ -186,6 +186,7 @@ class Corrections:
             return np.zeros(shape, bool)
         given = self.bad_pixels
         if not isinstance(given, (str, os.PathLike)):
+            require_unmasked("bad_pixels", given, ImageError, "Give its data, not 0 for pixels to mask.")
             given = np.asarray(given)
             given = given.astype(np.uint8) if given.dtype == bool else given
         found = frame_like(given, "bad_pixels", shape)

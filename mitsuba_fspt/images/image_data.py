@@ -41,8 +41,10 @@ class ImageData:
             if np.ma.is_masked(values):
                 masks.append(np.ma.getmaskarray(values))
         object.__setattr__(self, "mask", _own(np.logical_or.reduce(masks), bool) if masks else None)
-        if self.error is not None and not (self.error >= 0).all():
-            raise ImageError(f"image: 'error' must be >= 0, got {self.error.min():g}. Give an absolute error [W].")
+        if self.error is not None:
+            counted = self.error if self.mask is None else self.error[~self.mask]
+            if (counted < 0).any():
+                raise ImageError(f"image: 'error' must be >= 0, got {counted.min():g}. Give an absolute error [W].")
         if self.flat is not None and not (self.flat > 0).all():
             raise ImageError(f"image: 'flat' must be > 0, got {self.flat.min():g}. Mask such pixels, with 1 in 'flat'.")
         for name in ("flat_error", "dark_noise"):
@@ -139,8 +141,8 @@ def _plane(name: str, values: ArrayLike) -> NDArray[np.floating]:
 
 
 def _own(array: NDArray, dtype: DTypeLike) -> NDArray:
-    """The values of an array, read-only: a copy, unless nobody can write into the array itself."""
-    if array.dtype == dtype and array.base is None and not array.flags.writeable:
+    """The values of an array, read-only: a copy, unless the array is read-only and no view of another one."""
+    if type(array) is np.ndarray and array.dtype == dtype and array.base is None and not array.flags.writeable:
         return array
     own = np.array(array, dtype)
     own.flags.writeable = False
@@ -148,13 +150,19 @@ def _own(array: NDArray, dtype: DTypeLike) -> NDArray:
 
 
 def require_upright(thing: str, values: object, error: type[FsptError]) -> None:
-    """Raise `error` for an array of xarray whose x is first, or whose y in mm begins at the bottom."""
-    dimensions, coordinates = getattr(values, "dims", ()), getattr(values, "coords", {})
+    """Raise `error` for an array of xarray with x before y, or whose x or y [mm] runs the other way than an `Image`'s.
+
+    An `Image` has the largest y in row 0, the least x in column 0.
+    """
+    dimensions, coordinates = getattr(values, "dims", ())[-2:], getattr(values, "coords", {})
     if dimensions == ("x", "y"):
-        raise error(f"{thing} has the dimensions (x, y). Give .transpose('y', 'x').")
+        raise error(f"{thing} has the dimensions (x, y). Give .transpose(..., 'y', 'x').")
     for axis, descends in (("y", True), ("x", False)) if dimensions == ("y", "x") else ():
         place = coordinates.get(axis)
         if place is None or place.attrs.get("units") != "mm" or len(place) < 2 or (place[0] > place[-1]) == descends:
             continue
-        order = "descend, as row 0 is the top" if descends else "ascend"
-        raise error(f"{thing} has {axis} [mm] that must {order}. Give .sortby('{axis}', {not descends}).")
+        order, sign = ("descend", "upwards") if descends else ("ascend", "to the right")
+        raise error(
+            f"{thing} has {axis} [mm] that must {order}, as {axis} counts {sign}. Give .sortby('{axis}', "
+            f"{not descends}), or .values if your {axis} counts the other way."
+        )

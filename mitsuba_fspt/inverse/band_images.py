@@ -15,10 +15,11 @@ from ..optics.media import Source
 from ..optics.shapes import Sphere
 from ..runtime.errors import FluxError, InversionError
 from ..runtime.interrupt import in_threads
+from ..runtime.stderr_lines import told
 from ..tissue.border_surface import nearest_points
 from ..tissue.diffusion import Tissue
 from ..tissue.solution import TissueSolution
-from .measurement import Measurement, told
+from .measurement import Measurement
 from .model_error import MODEL_ERRORS
 from .surface import Surface
 from .transport_matrix import TransportMatrix

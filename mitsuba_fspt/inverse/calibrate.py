@@ -24,11 +24,12 @@ from ..rendering.scene_rules import is_number
 from ..rendering.scene_xml import is_text
 from ..runtime.errors import InversionError, named, renamed
 from ..runtime.progress_bar import Progress, reported
+from ..runtime.stderr_lines import told
 from .band_light import light_notes
 from .calibrated_scene import write_calibrated
 from .calibration_fit import CalibrationFit, CalibrationSettings, Fitted, Measured
 from .derivatives import scene_text, varied_value
-from .measurement import noise_of, tell_left_out, tell_misfit, told
+from .measurement import noise_of, tell_left_out, tell_misfit
 from .view_factors import gain_error_of
 
 Array = NDArray[np.float64]

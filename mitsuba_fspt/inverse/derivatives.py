@@ -76,8 +76,8 @@ def derivatives(
     scene : name or text of a scene file, or a scene that `load` made of one. Its file or text is loaded again with the
         values that it was loaded with: what was changed in a loaded scene afterwards has no effect
     names : of `<default>` parameters that are numbers, but for those of the film and of the integrator
-    rtol : of the integral, relative to the brightest pixel; 1e-5 unless given. On meshes with J_n on their vertices that
-        takes minutes; with 1e-3 seconds, for derivatives whose stated error is some tenths of a percent
+    rtol : of the integral, relative to the brightest pixel; 1e-5 unless given. On meshes with J_n on their vertices
+        that takes minutes; with 1e-3 seconds, for derivatives whose stated error is some tenths of a percent
     sensor : number of the sensor
     steps : how the step is chosen
     parameters : values of `<default>` parameters at which the derivatives are taken

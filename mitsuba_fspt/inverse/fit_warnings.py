@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, hstack
 from scipy.stats import norm
 
-from .measurement import LOG, tell_misfit, told
+from ..runtime.stderr_lines import told
+from .measurement import LOG, tell_misfit
 from .nonnegative import factor
 from .patterns import Patterns, views_of
 from .problem import Fit, Problem

@@ -21,6 +21,7 @@ from ..images.image import Image
 from ..runtime.errors import InversionError, renamed
 from ..runtime.numbers import number, whole
 from ..runtime.progress_bar import Progress, reported
+from ..runtime.stderr_lines import told
 from ..tissue.diffusion import Tissue
 from ..tissue.elements import Elements
 from ..tissue.phantom_file import PhantomFile, Spread
@@ -28,7 +29,7 @@ from .band_images import BandImages
 from .band_light import tell_bands
 from .extent import SHAPES, Profile, with_radii
 from .location import Intervals, Location
-from .measurement import Measurement, tell_misfit, told
+from .measurement import Measurement, tell_misfit
 from .optics_fit import OpticsFit, unknowns
 from .source_fit import LocationSettings, SourceFit
 from .source_grid import SourceGrid

@@ -18,9 +18,11 @@ from scipy.spatial import cKDTree
 from ..detector.reduction import measured
 from ..images.exposure import Exposure
 from ..images.image import Image
+from ..images.image_data import require_upright
 from ..images.noise_model import NoiseModel, is_known, response_of
 from ..runtime.errors import ImageError, InversionError
-from ..runtime.numbers import number, stacked
+from ..runtime.numbers import number, require_unmasked, stacked
+from ..runtime.stderr_lines import told
 from .band_light import light_of_images
 from .common_noise import CommonNoise, squared_correlations
 from .stray_matrix import stray_light_of, without_glare_of
@@ -208,6 +210,9 @@ class Measurement:
         """
         if isinstance(images, (Image, Exposure, str, os.PathLike)):
             images = [images]
+        for name, plane in (("images", images), ("error", error), ("mask", mask)):
+            require_upright(f"invert: '{name}'", plane, InversionError)
+        require_unmasked("invert: 'error'", error, InversionError, "Give its data, and its mask as 'mask'.")
         if isinstance(images := stacked(images), np.ma.MaskedArray):
             mask = np.ma.getmaskarray(images) | (False if mask is None else np.asarray(mask))
             images = images.filled(0)
@@ -511,10 +516,3 @@ def _checked_error(error: ArrayLike, shape: tuple[int, int, int], verb: str) -> 
     if not (np.isfinite(given).all() and (given >= 0).all()):
         raise InversionError(f"{verb}: 'error' has values that are negative, NaN or infinite. Give W, >= 0.")
     return given
-
-
-def told(verb: str, lines: Sequence[str]) -> list[str]:
-    """The lines, each written to stderr as a warning of `verb`."""
-    for line in lines:
-        LOG.warning("fspt: %s: %s", verb, line)
-    return list(lines)

@@ -124,7 +124,7 @@ class TransportMatrix(LinearOperator):
         if isinstance(images, (list, tuple)) and any(isinstance(image, Image) for image in images):
             self._check_images(images)
         for image in images if isinstance(images, (list, tuple)) else [images]:
-            require_unmasked("transport: images", image, TransportError, "Fill it, for example with zeros.")
+            require_unmasked("transport: images", image, TransportError, "Fill it; pixels of 0 W count as dark.")
             require_upright("transport: an image", image, TransportError)
         try:
             power = np.asarray(
@@ -174,6 +174,11 @@ class TransportMatrix(LinearOperator):
         return _finite("J", given)
 
     # ------------------------------------------------------------------ SciPy's interface
+
+    def dot(self, x: Any) -> Any:
+        """T x, also as `T @ x`; TransportError where a masked array hides values, which SciPy would take."""
+        require_unmasked("transport: J", x, TransportError, "Fill it, for example with zeros.")
+        return super().dot(x)
 
     def _matvec(self, x: Array) -> Array:
         x = self._exitance(np.ravel(x))
@@ -292,6 +297,11 @@ class StrayMatrix(TransportMatrix):
         )
 
     # ------------------------------------------------------------------ SciPy's interface
+
+    def dot(self, x: Any) -> Any:
+        """T x, also as `T @ x`; TransportError where a masked array hides values, which SciPy would take."""
+        require_unmasked("transport: J", x, TransportError, "Fill it, for example with zeros.")
+        return super().dot(x)
 
     def _matvec(self, x: Array) -> Array:
         return self._spread(self.base.forward(np.ravel(x))).ravel()

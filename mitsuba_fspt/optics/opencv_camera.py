@@ -23,7 +23,7 @@ from .thin_lens import Lens
 
 Array = NDArray[np.float64]
 TOLERANCE = 0.5  # pixels: largest shift of an image corner by properties of K that a lens with square pixels lacks
-LARGEST_TURN = 2 * math.pi  # rad; OpenCV's are at most half of it, but for rounding and for steps of a fit
+LARGEST_TURN = 6.3  # rad, 2 pi and rounding; OpenCV's are at most half of it, but for steps of a fit
 WIDEST = 3.0  # largest size, over that of the image, of a film with the principal point in the middle
 
 

@@ -93,7 +93,7 @@ def _checked_unit(raw: RawMesh, found: SurfaceValues, unit: str, given: bool) ->
     scaled = f"{unit}, by the standard of its format; scaled to mm, values from W/{unit}^2 to W/mm^2"
     entries = {} if given or unit == "mm" else {"mesh_unit": scaled}
     if UP in raw.stated:
-        entries["mesh_axes"] = f"as in the file, {raw.stated[UP]} up by its standard; a scene turns the phantom about z"
+        entries["mesh_axes"] = f"as in the file, {raw.stated[UP]} up by its standard; 'view' turns a phantom about z"
     with np.errstate(over="ignore"):  # Phantom refuses vertices so far away
         diagonal = float(np.linalg.norm(np.ptp(found.vertices[found.faces].reshape(-1, 3), axis=0)))
     warning = unit_warning(diagonal, unit)

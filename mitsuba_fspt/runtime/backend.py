@@ -34,7 +34,7 @@ INSTALL = (
     f"Or set {libllvm.ENVIRONMENT_NAME} to the library's file before Python starts."
 )
 SUPPORTED = ("llvm_", "cuda_")  # beginnings of the variants' names
-_loading = RLock()  # a second thread would see a Mitsuba that is half loaded
+_loading = RLock()  # else a second thread that calls this would see a Mitsuba that is half loaded
 
 
 class ImportWatch:

@@ -226,8 +226,8 @@ def _checked(reference: Reference, image: Image) -> Reference:
     if rms <= APART:
         return reference
     check = (
-        f"the integral's image is another one: RMS difference beyond both errors {rms:.1e} of the peak, "
-        f"{image.total_power / reference.power.sum():.4g} of the reference's power"
+        f"the integral's image differs from it by {rms:.1e} of the peak (root mean square of what both errors do not "
+        f"explain), its power is {image.total_power / reference.power.sum():.4g} times the reference's"
     )
     LOG.warning(
         "fspt: converge: reference '%s': %s. Give one of the same parameters and power of the source.",

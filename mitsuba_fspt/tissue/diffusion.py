@@ -37,7 +37,7 @@ Index = NDArray[np.int64]
 
 LOG = logging.getLogger("mitsuba_fspt")
 LARGEST_IMBALANCE = 1e-5
-SAME_INDEX = 0.03  # relative change of n inside the tissue, above which it is told
+SAME_INDEX = 0.035  # relative change of n inside the tissue, above which it is told
 SMOOTHED = 1.0  # mean free paths over which the radiance at the border follows its curvature and creases
 
 
@@ -133,9 +133,9 @@ class Tissue:
         cell, side = np.unravel_index(np.argmax(change), change.shape)
         if change[cell, side] > 1 + SAME_INDEX:
             lines.append(
-                f"'n' changes from {n[cell]:g} to {n[self.mesh.neighbours[cell, side]]:g} inside the tissue, where it "
-                "neither reflects nor refracts here: only the n at the surface counts. Light that crosses such a "
-                "border is wrong, by some 10 % from 1 to 1.37."
+                f"'n' changes from {n[cell]:g} to {n[self.mesh.neighbours[cell, side]]:g} inside the tissue. "
+                "Reflection and refraction at such a border are left out, as only the n at the surface counts: between "
+                "1 and 1.37 the computed power behind it is some 10 % too small or too large."
             )
         return lines
 

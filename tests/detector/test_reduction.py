@@ -554,7 +554,7 @@ def test_an_image_in_memory_is_no_counts(given):
     """As its file is none. Seen to fail: electrons were taken for DN, without their bias and gain."""
     exposure = CCD.expose(ramp(), 60, 650, seed=1)
     assert CCD.reduce(exposure.counts, exposure_time=60, wavelength_nm=650).power.max() > 0
-    with pytest.raises(ImageError, match=r"'counts' are an (Exposure|Image), of power or electrons\. Give counts"):
+    with pytest.raises(ImageError, match=r"'counts' must be counts \[DN\], got an (Exposure|Image), which holds"):
         CCD.reduce(given(exposure), exposure_time=60, wavelength_nm=650)
 
 
@@ -563,6 +563,8 @@ def test_masked_counts_are_refused():
     counts = np.ma.masked_greater(np.arange(12.0).reshape(3, 4), 9)
     with pytest.raises(ImageError, match=r"masked array that hides 2 values\. Give its data, and its mask as 'bad_pix"):
         counts_of(counts, "counts")
+    with pytest.raises(ImageError, match="masked array that hides 2 values"):
+        counts_of([counts, counts], "counts")  # seen to fail: two frames
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".fits"])

@@ -131,13 +131,14 @@ def test_what_a_masked_array_hides_is_masked():
     assert image.mask.tolist() == [[True, False], [True, True]]
     assert image.total_power == 2
     assert Image(np.ma.array(np.ones((2, 2)))).mask is None
+    assert Image([[1.0, 2.0]], [[-1, 1]], mask=[[True, False]]).error.tolist() == [[-1, 1]]  # -1 where there is none
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda array: array.T, r"the dimensions \(x, y\)\. Give \.transpose\('y', 'x'\)"),
-        (lambda array: array.sortby("y"), r"has y \[mm\] that must descend.*Give \.sortby\('y', False\)"),
+        (lambda array: array.T, r"the dimensions \(x, y\)\. Give \.transpose\(\.\.\., 'y', 'x'\)"),
+        (lambda array: array.sortby("y"), r"has y \[mm\] that must descend.*Give \.sortby\('y', False\), or \.values"),
         (lambda array: array.sortby("x", False), r"has x \[mm\] that must ascend.*Give \.sortby\('x', True\)"),
     ],
 )

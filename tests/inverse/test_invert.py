@@ -205,6 +205,8 @@ def test_masked_pixels_do_not_count(case):
     np.testing.assert_array_equal(one.exitance, other.exitance)
     listed = fspt.invert(matrix, list(hidden), error=error)  # seen to fail: what the masks hide counted
     np.testing.assert_array_equal(listed.exitance, other.exitance)
+    with pytest.raises(InversionError, match="'error' is a masked array"):  # seen to fail: its mask had no effect
+        fspt.invert(matrix, hidden.data, error=np.ma.array(error, mask=mask))
     mask = np.zeros(matrix.image_shape, bool)
     mask[1:] = True
     front = fspt.invert(matrix, images, mask=mask, **options)

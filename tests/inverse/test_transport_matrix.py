@@ -331,7 +331,7 @@ def test_areas_cannot_be_written_into(matrix):
 def test_vectors_that_do_not_fit_are_refused(matrix):
     """Masked arrays, too. Seen to fail: `T @ J` and `backward` took what the mask hides."""
     hidden = np.ma.array(np.ones(162), mask=np.arange(162) == 3)
-    for product in (matrix.forward, matrix.matvec):
+    for product in (matrix.forward, matrix.matvec, matrix.dot, lambda values: matrix @ values):
         with pytest.raises(TransportError, match=r"J is a masked array that hides 1 values\. Fill it"):
             product(hidden)
     with pytest.raises(TransportError, match="images is a masked array that hides 504 values"):

@@ -292,7 +292,7 @@ def test_a_reference_of_another_image_is_told(caplog):
     assert converge._checked(noisy, image) is noisy
     assert caplog.text == ""
     told = converge._checked(converge.Reference(power * 1e-9, power * 1e-12, "r.exr"), image)
-    assert "beyond both errors 7.3e+08 of the peak, 1e+09 of the reference's power" in told.check
+    assert "its power is 1e+09 times the reference's" in told.check
     assert "fspt: converge: reference 'r.exr': the integral's image is another one" in caplog.text
 
 
