@@ -293,7 +293,7 @@ def test_a_reference_of_another_image_is_told(caplog):
     assert caplog.text == ""
     told = converge._checked(converge.Reference(power * 1e-9, power * 1e-12, "r.exr"), image)
     assert "its power is 1e+09 times the reference's" in told.check
-    assert "fspt: converge: reference 'r.exr': the integral's image is another one" in caplog.text
+    assert "fspt: converge: reference 'r.exr': the integral's image differs from it by" in caplog.text
 
 
 @pytest.mark.parametrize("case", ["missing", "junk", "no error", "size", "dark", "nan", "text", "pickle"])
