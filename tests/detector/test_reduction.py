@@ -560,7 +560,7 @@ def test_an_image_in_memory_is_no_counts(given):
 
 def test_masked_counts_are_refused():
     """Seen to fail: what the mask hides counted."""
-    counts = np.ma.masked_greater(np.arange(12.0).reshape(3, 4), 9)
+    counts = np.ma.masked_greater(np.arange(30.0).reshape(5, 6), 27)
     with pytest.raises(ImageError, match=r"masked array that hides 2 values\. Give its data, and its mask as 'bad_pix"):
         counts_of(counts, "counts")
     with pytest.raises(ImageError, match="masked array that hides 2 values"):
