@@ -37,7 +37,7 @@ Index = NDArray[np.int64]
 
 LOG = logging.getLogger("mitsuba_fspt")
 LARGEST_IMBALANCE = 1e-5
-SAME_INDEX = 0.035  # relative change of n inside the tissue, above which it is told
+SAME_INDEX = 0.035  # largest relative change of n inside the tissue that is not told: of water in tissue, 1.33 in 1.37
 SMOOTHED = 1.0  # mean free paths over which the radiance at the border follows its curvature and creases
 
 
