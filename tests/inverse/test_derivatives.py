@@ -7,7 +7,7 @@ import pytest
 from small_scenes import LENS_XML, collected, mi, write_scene
 
 import mitsuba_fspt as fspt
-from mitsuba_fspt.inverse.derivatives import Steps, _Differences
+from mitsuba_fspt.inverse.derivatives import Steps, _as_accurate_as_wanted, _Differences
 from mitsuba_fspt.rendering import live_scene
 from mitsuba_fspt.runtime.errors import InversionError
 
@@ -65,7 +65,7 @@ def test_a_distorted_field_by_k1(tmp_path, mono):
     more = '<string name="distortion" value="$k1, 0.2, 0.01, 0"/>\n        <transform name="to_world">'
     sensor = '<default name="k1" value="-0.3"/>' + LENS_XML.replace('<transform name="to_world">', more)
     scene = write_scene(tmp_path / "s.xml", sensor=sensor, shapes=DISK)
-    found = fspt.derivatives(scene, ["k1"])["k1"]
+    found = fspt.derivatives(scene, ["k1"], rtol=1e-5)["k1"]
 
     def image(k1):
         return fspt.render(fspt.load(scene, k1=k1), rtol=1e-5).power.astype(np.float64)
@@ -107,7 +107,7 @@ def test_a_half_plane_that_is_shifted(tmp_path, mono):
     with a = r + (s − r) u/(u − z): dP/ds = −J/π ∫ dA_vd ∫ chord · cos⁴θ/u² · u/(z_edge − u). Both axes to 1e-3.
     """
     scene = write_scene(tmp_path / "wall.xml", shapes=WALL)
-    found = fspt.derivatives(fspt.load(scene), ["shift"])["shift"]
+    found = fspt.derivatives(fspt.load(scene), ["shift"], rtol=1e-5)["shift"]
     u, depth, side, radius, shift = 165.0, 180.0, 1.6, 55 / 8 / 2, 0.3
     x = np.arange(8) - 4 + ((np.arange(2000) + 0.5) / 2000)[:, None, None]  # the chord has a kink at either end
     y = np.arange(6)[:, None] - 2.5
@@ -174,3 +174,26 @@ def test_differences_are_of_fourth_order():
     found = _Differences("x", 1.0, picture, Steps(first=0.1, most=0)).best()
     assert found.value[0, 0] / np.e - 1 == pytest.approx(-4e-4 / 120, rel=0.05, abs=0)
     assert abs(found.value[0, 0] - np.e) < found.error[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("share", "lines", "expected"),
+    [
+        (0.01, 100, [1e-3]),  # accurate at once
+        (1.0, 100, [1e-3, 1e-4]),
+        (10.0, 100, [1e-3, 1e-4, 1e-5]),  # never: the smallest rtol
+        (10.0, 100_000, [1e-3, 1e-4]),  # a tenth of that would take more lines than allowed
+    ],
+)
+def test_integrals_are_as_accurate_as_the_derivative_needs(share, lines, expected):
+    """dP/dx of P = x² at x = 1 from images whose errors are a share of rtol; steps may take 1e7 lines of sight."""
+    asked = []
+
+    def image(rtol, change):
+        asked.append(rtol)
+        error = np.full((1, 1), share * rtol)
+        return fspt.Image(np.full((1, 1), change["x"] ** 2), error, metadata={"nodes": lines * round(1e-3 / rtol)})
+
+    found = _as_accurate_as_wanted("x", 1.0, image, Steps(first=0.1, most=0, lines=10_000_000))
+    assert sorted(set(asked), reverse=True) == pytest.approx(expected)
+    assert found.value[0, 0] == pytest.approx(2.0, rel=1e-6)
