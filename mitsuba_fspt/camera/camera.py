@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..jit.from_numpy import from_numpy
 from ..optics.discs import defocus
 from ..optics.pixel_etendue import full_etendue
 from ..optics.thin_lens import Lens
@@ -99,7 +100,7 @@ class Camera:
             if vignetting is not None:
                 self.shares = vignetting.on_pixels(pixel_pitch, film.size, film.crop_offset, film.crop_size)
         self.pupil = Pupil(lens)
-        self._shares = None if self.shares is None else mi.Float(self.shares.ravel().astype(np.float32))
+        self._shares = None if self.shares is None else from_numpy(mi.Float, self.shares)
         # Opaque, so that a new value needs no compilation.
         dr.make_opaque(self.to_world)
         self._u = dr.opaque(mi.Float, lens.focus_distance)
@@ -355,5 +356,5 @@ class Camera:
         _, scale = defocus(p[..., 2:], u, disc.shift)
         scale = np.where(scale > 0, scale, 1)  # elsewhere the radius is infinite
         centre = self.film_map.ideal_in_double(p[..., :2], scale)
-        blur = self.blur_radius(mi.Float64(p[..., 2].ravel())).numpy()
+        blur = self.blur_radius(from_numpy(mi.Float64, p[..., 2])).numpy()
         return centre, np.abs(blur).reshape(p[..., 2:].shape)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..jit.from_numpy import from_numpy
 from .camera import MOST_RIM, Camera
 
 Box = tuple[float, ...]  # x, y, z of the lowest and of the highest corner [mm]
@@ -98,7 +99,7 @@ class Window:
             return np.ones(self.shape, bool)
         left, top = self.corner
         y, x = np.divmod(np.arange((self.shape[0] + 1) * (self.shape[1] + 1)), self.shape[1] + 1)
-        corners = mi.Point2f(mi.Float(x + float(left)), mi.Float(y + float(top)))
+        corners = mi.Point2f(from_numpy(mi.Float, x + left), from_numpy(mi.Float, y + top))
         share = camera.open_pupil(corners, mi.Point2f(0))[1].numpy().reshape(self.shape[0] + 1, -1)
         # The positions with the whole pupil are those of a disc, so that the corners of a pixel suffice.
         whole = share > 1 - OPEN

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .from_numpy import from_numpy
 from .pixel_grid import AROUND, Grid
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class BlockGrid(Grid):
         self._count = len(row) * side**2
         number = np.full(blocks.shape, -1, np.int32)
         number[row, column] = np.arange(len(row))
-        self._blocks, self._rows = mi.Int(number.ravel()), (mi.Int(row), mi.Int(column))
+        self._blocks, self._rows = from_numpy(mi.Int, number), tuple(from_numpy(mi.Int, of) for of in (row, column))
         self._shift, self._columns = (dr.opaque(mi.Int, n) for n in (side.bit_length() - 1, blocks.shape[1]))
         self._height, self._width = (dr.opaque(mi.Int, n) for n in self.shape)
         self.number = dr.arange(mi.UInt32, self._count)
@@ -60,8 +61,8 @@ class BlockGrid(Grid):
     def flat(self, array: NDArray[Any]) -> Any:
         """Values or mask on the grid, from an array (h, w) of the whole image."""
         side, (rows, columns) = self.side, self.blocks.shape
-        own = array.reshape(rows, side, columns, side).swapaxes(1, 2)[self.blocks].ravel()
-        return mi.Bool(own) if own.dtype == bool else mi.Float64(own)
+        own = array.reshape(rows, side, columns, side).swapaxes(1, 2)[self.blocks]
+        return from_numpy(mi.Bool if own.dtype == bool else mi.Float64, own)
 
     def lay(self, image: Any, array: NDArray[Any]) -> None:
         """Write values on the grid into an array (h, w) of the whole image."""

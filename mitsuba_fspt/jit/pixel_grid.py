@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .from_numpy import from_numpy
+
 if TYPE_CHECKING:
     PixelArray = mi.Float64  # h · w entries, row by row; masks likewise
     Mask = mi.Bool
@@ -71,8 +73,7 @@ class Grid:
 
     def flat(self, array: NDArray[Any]) -> Any:
         """Image or mask from an array (h, w)."""
-        flat = np.ascontiguousarray(array).ravel()
-        return mi.Bool(flat) if flat.dtype == bool else mi.Float64(flat)
+        return from_numpy(mi.Bool if array.dtype == bool else mi.Float64, array)
 
     def array(self, image: Any) -> NDArray[Any]:
         """Array (h, w) of an image or mask."""

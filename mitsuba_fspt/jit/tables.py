@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .from_numpy import from_numpy
+
 
 class Table:
     """Columns of equally many numbers, read by their names; `columns` in their order.
@@ -18,7 +20,7 @@ class Table:
 
     def __init__(self, columns: Mapping[str, NDArray[np.float64]]) -> None:
         self._numbers = {name: number for number, name in enumerate(columns)}
-        self._values = mi.Float(np.concatenate(list(columns.values())).astype(np.float32))
+        self._values = from_numpy(mi.Float, np.concatenate(list(columns.values())))
         self.rows = dr.opaque(mi.UInt32, len(next(iter(columns.values()))))
 
     def gather(self, name: str, row: mi.UInt32) -> mi.Float:

@@ -25,6 +25,7 @@ from ..integral.shortcuts import SHORTCUTS
 from ..integral.solution import Solution
 from ..integral.solver import Solver
 from ..integral.work_log import WorkLog
+from ..jit.from_numpy import from_numpy
 from ..runtime.cached_value import CachedValue
 from ..runtime.deadline import Deadline
 from ..runtime.errors import SceneError, named
@@ -119,7 +120,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
             self._derivative.kinds(scene, camera_of(sensor), asked)
         solution = self.solve(scene, sensor)
         self._log_warnings(scene, sensor)
-        return mi.TensorXf(solution.power[..., None].astype(np.float32))
+        return mi.TensorXf(from_numpy(mi.Float, solution.power), (*solution.power.shape, 1))
 
     def render_forward(
         self,
@@ -135,7 +136,7 @@ class FsptIntegral(mi.ad.integrators.common.ADIntegrator):
         """
         with self._rows(scene, sensor) as (rows, view, surfaces):
             tangent = rows.forward(view, self.quadrature, surfaces)
-        return mi.TensorXf(tangent[..., None].astype(np.float32))
+        return mi.TensorXf(from_numpy(mi.Float, tangent), (*tangent.shape, 1))
 
     def render_backward(
         self,

@@ -56,13 +56,14 @@ class MovedShapes:
         """Set one parameter to its first value, moved."""
         import mitsuba as mi
 
+        from ..jit.from_numpy import from_numpy
         from ..jit.mesh_buffers import motions_of, shaped_like
 
         fourth = motions_of([name], name.rpartition(".")[0] + ".").get(name)
         if fourth is not None:
             home = self._home.setdefault(name, np.array(parameters[name], np.float64).reshape(-1, 3))
             moved = home @ motion[:3, :3].T + fourth * motion[:3, 3]
-            parameters[name] = shaped_like(parameters[name], moved.astype(np.float32).ravel())
+            parameters[name] = shaped_like(parameters[name], from_numpy(mi.Float, moved))
         else:
             home = self._home.setdefault(name, np.array(parameters[name].matrix, np.float64).reshape(4, 4))
             parameters[name] = mi.Transform4f(motion @ home)

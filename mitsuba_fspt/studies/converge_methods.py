@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..jit.from_numpy import from_numpy
 from ..rendering.monte_carlo import passes, tracer
 from .convergence import DIRECT_SUM, INTEGRAL, PATH, PTRACER, SURFACE_FORM
 
@@ -224,7 +225,7 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     columns = np.concatenate([pupil.reshape(2, -1), np.tile(rule.pixel.T, turns)])
     node = dr.arange(mi.UInt32, pixels * columns.shape[1])
     pixel, node = dr.gather(mi.UInt32, Grid(window.shape).pixels(), node % pixels), node // pixels
-    ax, ay, dx, dy = (dr.gather(mi.Float, mi.Float(column), node) for column in columns)
+    ax, ay, dx, dy = (dr.gather(mi.Float, from_numpy(mi.Float, column), node) for column in columns)
     ray, _, _ = camera.line_of_sight(window.centres(pixel) + mi.Point2f(dx, dy), mi.Point2f(ax, ay))
     dr.eval(ray)
 

@@ -21,6 +21,7 @@ from ..integral.lines.eq9 import eq9
 from ..integral.lines.occlusion import hidden
 from ..integral.lines.scene_checks import check_scene
 from ..jit.batches import batch_slices, numbered
+from ..jit.from_numpy import from_numpy
 from ..jit.recording import recording
 from ..jit.spectra import scalar
 
@@ -82,12 +83,12 @@ def _add(
     pixel: Index,
 ) -> None:
     """Add the contributions of the pairs to their pixels, one array entry per pair, in one kernel."""
-    number = mi.UInt32(pixel.astype(np.uint32))
+    number = from_numpy(mi.UInt32, pixel)
     width = dr.opaque(mi.UInt32, camera.film.crop_size[0])
     corner = mi.Point2f(*(dr.opaque(mi.Float, n + 0.5) for n in camera.film.crop_offset))
     position = corner + mi.Vector2f(mi.Float(number % width), mi.Float(number // width))
 
-    si, area = elements.place(mi.UInt32(index.astype(np.uint32)), mi.Point2f(*elements.middle))
+    si, area = elements.place(from_numpy(mi.UInt32, index), mi.Point2f(*elements.middle))
     centre, radius, _ = camera.blur_disc(si.p)
     pupil = mi.Point2f((camera.film_map.to_ideal(position) - centre) / radius)
     _, lens_point, passes, cos_d = camera.arrival(si.p, pupil)

@@ -134,6 +134,7 @@ def mesh(
     def shape_at(pose: mi.ScalarTransform4f) -> mi.Mesh:
         import mitsuba as mi
 
+        from ..jit.from_numpy import from_numpy
         from ..jit.mesh_buffers import add_attribute, new_mesh
 
         matrix = np.array(pose.matrix, np.float64)
@@ -143,10 +144,10 @@ def mesh(
             texture = {"type": "mesh_attribute", "name": f"{kind}_exitance"}
         props = mi.Properties()
         props["glow"] = mi.load_dict({"type": "fspt_surface", "exitance": texture, **(law or {})})
-        positions = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-        built = new_mesh("mesh", positions.ravel(), faces.ravel(), props)
+        positions = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        built = new_mesh("mesh", from_numpy(mi.Float, positions), from_numpy(mi.UInt32, faces), props)
         if np.ndim(exitance):
-            add_attribute(built, f"{kind}_exitance", np.asarray(exitance, np.float32))
+            add_attribute(built, f"{kind}_exitance", from_numpy(mi.Float, exitance))
         return built
 
     return shape_at

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...jit.from_numpy import from_numpy
 from ...jit.loops import repeat
 from ...optics.media import Medium, scattering_warning
 from ...runtime.errors import ExitanceError
@@ -40,8 +41,8 @@ class LastFlight(ExitLaw):
         self.medium, self.fluence = medium, fluence
         self._n = dr.opaque(mi.Float, medium.n)
         flight, weight = np.polynomial.laguerre.laggauss(NODES)
-        self._flight = mi.Float(flight / (medium.mua + medium.musp))
-        self._weight = mi.Float(weight)
+        self._flight = from_numpy(mi.Float, flight / (medium.mua + medium.musp))
+        self._weight = from_numpy(mi.Float, weight)
         self._hemisphere = _hemisphere()
         self._total: _Table | None = None  # ∫ of `_relative_radiance` times µ over the hemisphere
         self._values: mi.Float | None = None  # grid values of the volume at the time of `prepare`
@@ -164,7 +165,7 @@ def _hemisphere() -> tuple[mi.Float, ...]:
     azimuth = 2 * np.pi * (np.arange(SPOKES) + np.arange(RINGS)[:, None] / RINGS) / SPOKES
     sine = np.sqrt(1 - mu**2)[:, None]
     columns = (sine * np.cos(azimuth), sine * np.sin(azimuth), mu[:, None], ring[:, None])
-    return tuple(mi.Float(np.broadcast_to(column, azimuth.shape).ravel()) for column in columns)
+    return tuple(from_numpy(mi.Float, np.broadcast_to(column, azimuth.shape)) for column in columns)
 
 
 def _extent(box: mi.BoundingBox3f) -> str:

@@ -23,6 +23,7 @@ import numpy as np
 from ...camera.camera import Camera
 from ...emission.face_table import FaceTable, shape_number
 from ...emission.of_emitter import surfaces_of
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import box_of, face_count
 from ...jit.spectra import at_one_wavelength, scalar
 from ...runtime.plugin_types import is_surface
@@ -196,4 +197,4 @@ def _emitting(shapes: list[mi.Shape]) -> mi.Float | None:
     numbers = [shape_number(shape) for shape in shapes]
     table = np.zeros(max(numbers) + 1, np.float32)
     table[numbers] = emitting
-    return mi.Float(table)
+    return from_numpy(mi.Float, table)

@@ -20,6 +20,7 @@ from ...camera.camera import Camera
 from ...camera.window import Box, corners_of
 from ...emission.face_table import shape_number
 from ...emission.of_emitter import surfaces_of
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import box_of, is_shaded_smoothly, shading_normals
 from ...jit.plugin_objects import made
 from ...jit.spectra import at_one_wavelength, scalar
@@ -120,11 +121,11 @@ class Specular:
                 )
                 for k, (pair, plane) in enumerate(zip(bent, planes, strict=True))
             ),
-            mi.UInt32(bsdf),
-            mi.UInt32(parts),
+            from_numpy(mi.UInt32, bsdf),
+            from_numpy(mi.UInt32, parts),
             int(parts.max()),
-            mi.Float(reach.ravel()),
-            mi.Float(lift),
+            from_numpy(mi.Float, reach),
+            from_numpy(mi.Float, lift),
             quadrature.max_specular,
             quadrature.least_weight,
             tuple(its for _, its in shapes),

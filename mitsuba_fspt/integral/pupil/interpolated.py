@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...camera.window import Window
 from ...jit.block_grid import BlockGrid
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import box_of
 from ...jit.pixel_grid import COVERAGE_ROUNDING, Grid, parted
 from ..lines.eq9 import View
@@ -234,10 +235,10 @@ class _BlockImage:
         """
         side, width = self.blocks.side, self.value.shape[1]
         row, column = np.divmod(number, width)
-        random = mi.sample_tea_32(mi.UInt32(number), mi.UInt32(STREAM & 0xFFFFFFFF))
+        random = mi.sample_tea_32(from_numpy(mi.UInt32, number), mi.UInt32(STREAM & 0xFFFFFFFF))
         i, j = (np.asarray(r.numpy() % side).astype(np.int64) for r in random)
         place = (row * side + i) * (width * side) + column * side + j
-        centres = self.sizes[-1].window.centres(mi.UInt32(place.astype(np.uint32)))
+        centres = self.sizes[-1].window.centres(from_numpy(mi.UInt32, place))
         seen = apply_rule(self.view, centres, node_rules.four(self.quadrature.pixel == "area"), ("value", "coverage"))
         dr.eval(seen.value, seen.coverage)
         self.rays += 4 * number.size

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ...jit.batches import batches
+from ...jit.from_numpy import from_numpy
 from ...jit.loops import repeat
 from ..lines.eq9 import most_radiance
 from ..quadrature import TOGETHER, Quadrature
@@ -118,7 +119,7 @@ def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]
         count //= 2
     taken = np.zeros(len(error), bool)
     taken[np.argpartition(error, -count)[-count:]] = True
-    return above & mi.Bool(taken)
+    return above & from_numpy(mi.Bool, taken)
 
 
 def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0, claimed: bool = True) -> int:

@@ -26,6 +26,7 @@ from ...emission.emitting_surface import EmittingSurface
 from ...emission.exitance import texels_of
 from ...emission.of_emitter import surfaces_of
 from ...jit.batches import numbered
+from ...jit.from_numpy import from_numpy
 from ...jit.loops import repeat
 from ...jit.pixel_grid import Grid
 from ...jit.spectra import at_one_wavelength, scalar
@@ -366,8 +367,8 @@ class _OnElements:
 def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, counts: Index) -> _OnElements:
     """Values at `counts` points of each element, the first in its middle."""
     index, number = numbered(counts)
-    sample = mi.Point2f(*(mi.Float(np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
-    si, area = elements.place(mi.UInt32(index), sample)
+    sample = mi.Point2f(*(from_numpy(mi.Float, np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
+    si, area = elements.place(from_numpy(mi.UInt32, index), sample)
     to_rim = _rim_above(si, camera) - si.p
     to_lens = dr.normalize(to_rim)
     at_one_wavelength(si)

@@ -21,6 +21,7 @@ import numpy as np
 from ...camera.camera import Camera
 from ...camera.window import Window
 from ...jit.batches import batches
+from ...jit.from_numpy import from_numpy
 from ...jit.pixel_grid import Grid
 from ..lines.eq9 import View
 from ..lines.specular import Specular
@@ -251,7 +252,7 @@ def peak_of_few(view: View, window: Window, quadrature: Quadrature) -> float:
     height, width = window.shape
     step = math.ceil(math.sqrt(height * width / FEW))
     y, x = (np.arange(step // 2, side, step, dtype=np.uint32) for side in window.shape)
-    centres = window.centres(mi.UInt32((y[:, None] * np.uint32(width) + x).ravel()))
+    centres = window.centres(from_numpy(mi.UInt32, y[:, None] * np.uint32(width) + x))
     seen = apply_rule(view, centres, node_rules.twelve(quadrature.pixel == "area"), ("value",))
     return MARGIN * float(dr.max(seen.value)[0])
 

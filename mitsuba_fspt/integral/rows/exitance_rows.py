@@ -26,6 +26,7 @@ from ...camera.camera import Camera
 from ...emission.emitting_surface import EmittingSurface
 from ...emission.exitance import attribute_name, function_on, texels_of, values_on
 from ...emission.of_emitter import surface_of, surfaces_of
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import triangles
 from ..lines.eq9 import View, eq9, etendue_from_pixel
 from ..pupil.lattices import VECTOR
@@ -148,12 +149,12 @@ class Rows:
             with dr.resume_grad():
                 for surface in surfaces:
                     values = values_on(surface.shape, surface.exitance)
-                    dr.backward_from(values * mi.Float(weights[self.columns[surface.mark]].astype(np.float32)))
+                    dr.backward_from(values * from_numpy(mi.Float, weights[self.columns[surface.mark]]))
             dr.eval()
             return
         of_pixels = gradient.ravel() * view.camera.pixel_etendues
         for part in self._parts(view, quadrature):
-            of_row = mi.Float(of_pixels[part.pixels] * part.factors)
+            of_row = from_numpy(mi.Float, of_pixels[part.pixels] * part.factors)
             weight = eq9(dr.gather(mi.Float, of_row, part.row), part.etendue)
             with dr.resume_grad():
                 radiance = part.radiance(surfaces)
@@ -276,7 +277,7 @@ def _places(
     lane, each = dr.arange(mi.UInt32, len(pixels) * lines), dr.opaque(mi.UInt32, lines)
     row = lane // each
     k = lane - row * each
-    pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), row)
+    pixel = dr.gather(mi.UInt32, from_numpy(mi.UInt32, pixels), row)
     step = dr.opaque(mi.UInt32, (1 << 32) // lines)
     # In units of 2⁻³², where whole numbers wrap around as a lattice does; the points are middles of their steps.
     places = (k * dr.opaque(mi.UInt32, generator) * step + (step >> 1) for generator in VECTOR)

@@ -18,6 +18,7 @@ from ...camera.camera import Camera
 from ...emission.elements import Elements, elements_of
 from ...emission.emitting_surface import EmittingSurface
 from ...jit.batches import batches
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import box_of
 from ...runtime.errors import SceneError
 from ..lines.courses import follow
@@ -57,7 +58,7 @@ def rows_of(
     elements = [elements_of(surface.shape, minimum=1) for surface in surfaces]
     found: list[list[tuple]] = [[] for _ in surfaces]
     width, offset = camera.film.crop_size[0], camera.film.crop_offset
-    numbers = mi.UInt32(pixels.astype(np.uint32))
+    numbers = from_numpy(mi.UInt32, pixels)
     start = dr.opaque(mi.Float, camera.clear_depth(box_of(scene.shapes())))
     for part in batches(dr.arange(mi.UInt32, len(pixels)), lines):
         place, line = dr.repeat(part, lines), dr.tile(dr.arange(mi.UInt32, lines), dr.width(part))
@@ -130,7 +131,7 @@ class _Hits:
                     f"specular shapes, at most {MOST_HITS} each are kept. Give a larger rtol."
                 )
             keys = [stored[name].numpy()[:number] for name in ("radiance", "face", "entry")]
-            order = mi.UInt32(np.lexsort(keys).astype(np.uint32))
+            order = from_numpy(mi.UInt32, np.lexsort(keys))
             hits = {name: dr.gather(type(array), array, order) for name, array in stored.items()}
             yield hits["entry"], hits["face"], [hits[corner] for corner in "abc"], hits["radiance"]
 

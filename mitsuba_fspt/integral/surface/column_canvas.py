@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...jit.from_numpy import from_numpy
 from .footprint import along_edges
 from .pixel_sums import PixelSums
 
@@ -111,7 +112,7 @@ class ColumnCanvas:
         # The `_Place` of each column, and last of a column without window.
         table = np.zeros((len(windows.left) + 1, PLACE), np.uint32)
         table[:-1, :5] = np.stack([windows.left, windows.top, windows.width, windows.height, self._starts[:-1]], -1)
-        self._table = mi.UInt32(table.ravel())
+        self._table = from_numpy(mi.UInt32, table)
         self.none = dr.opaque(mi.UInt32, len(windows.left))
         self._size = tuple(dr.opaque(mi.Float64, side) for side in shape[::-1])
         self._sums.evaluate(self._table)

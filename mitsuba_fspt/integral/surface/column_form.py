@@ -26,6 +26,7 @@ from ...camera.camera import Camera
 from ...camera.window import MOST_RIM
 from ...emission.elements import of_part
 from ...jit.batches import batch_slices, numbered
+from ...jit.from_numpy import from_numpy
 from ..lines.eq9 import eq9, etendue_from_pixel, etendue_from_surface
 from ..lines.occlusion import hidden
 from . import pupil_cells
@@ -162,13 +163,13 @@ def _laid(
 ) -> Array:
     """Light of some faces on the windows, see `ColumnCanvas.light`."""
     canvas = ColumnCanvas(shape, windows)
-    corners = mi.UInt32(faces.corners.ravel().astype(np.uint32))
+    corners = from_numpy(mi.UInt32, faces.corners)
     for some, cells, cuts, points, taken in plan.of(index).passes():
         items = np.stack([index[some], cells, cuts, points, taken @ (1 << np.arange(taken.shape[1]))])
         for run in batch_slices((items[1] * items[2]) ** 2):
             part = items[:, run]
             lines = FaceLines.numbered(part[:4])
-            face, mask = lines.face, dr.gather(mi.UInt32, mi.UInt32(part[4].astype(np.uint32)), lines.row)
+            face, mask = lines.face, dr.gather(mi.UInt32, from_numpy(mi.UInt32, part[4]), lines.row)
             planes, ring, count, active = lines.columns(scene, camera, faces, on)
             columns = [face] if on == "face" else [dr.gather(mi.UInt32, corners, 3 * face + k) for k in range(3)]
             columns = [dr.select(mask & (1 << k) != 0, column, canvas.none) for k, column in enumerate(columns)]
@@ -193,10 +194,10 @@ class FaceLines:
     def numbered(cls, items: Index) -> FaceLines:
         """All lines of n `items` (4, n): face, M, pieces along a side, whether cells are laid."""
         row, number = numbered((items[1] * items[2]) ** 2)
-        row = mi.UInt32(row.astype(np.uint32))
-        face, m, cut, at = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in items)
+        row = from_numpy(mi.UInt32, row)
+        face, m, cut, at = (dr.gather(mi.UInt32, from_numpy(mi.UInt32, of), row) for of in items)
         # Array entries beyond the last line gather 0, and whole numbers divided by 0 end the process.
-        return cls(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, mi.UInt32(number.astype(np.uint32)), row)
+        return cls(face, dr.maximum(m, 1), dr.maximum(cut, 1), at > 0, from_numpy(mi.UInt32, number), row)
 
     def columns(self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str) -> Laid:
         """The light of J_n = 1 of each column of the face, on the crop window."""
@@ -233,7 +234,7 @@ class FaceLines:
         lit_part = None
         if faces.shadows:
             ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
-            mixed = active & dr.gather(mi.Bool, mi.Bool(faces.mixed), face)
+            mixed = active & dr.gather(mi.Bool, from_numpy(mi.Bool, faces.mixed), face)
             lit_part = LitPart.of(scene, camera, node, ends, middle, mixed)
             within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
             spot, _ = elements.place(face, within, self.cut, part)
@@ -364,7 +365,7 @@ def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:
 
 def falloff_on_pixels(camera: Camera, x: Index, y: Index, corner: tuple[float, float]) -> Array:
     """Mean of `falloff` over pixels (n,), in columns x and rows y from the `corner` (x, y) on the film."""
-    left, top = mi.Float(x + float(corner[0])), mi.Float(y + float(corner[1]))
+    left, top = from_numpy(mi.Float, x + corner[0]), from_numpy(mi.Float, y + corner[1])
     even = np.zeros(len(x))
     for a in GAUSS if x.size else ():
         for b in GAUSS:

@@ -19,6 +19,7 @@ from ...camera.camera import Camera
 from ...emission.elements import Elements, elements_of
 from ...emission.emitting_surface import EmittingSurface
 from ...jit.batches import BATCH
+from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import triangles
 from ..estimator import Thresholds, bound
 from ..lines.occlusion import hidden
@@ -388,8 +389,8 @@ def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
 
 def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
     """Share of the lines of sight of each of some faces that nothing blocks, of `cells`² lines."""
-    index = mi.UInt32(np.repeat(faces, cells**2).astype(np.uint32))
-    number = mi.UInt32(np.tile(np.arange(cells**2), len(faces)).astype(np.uint32))
+    index = from_numpy(mi.UInt32, np.repeat(faces, cells**2))
+    number = from_numpy(mi.UInt32, np.tile(np.arange(cells**2), len(faces)))
     m = mi.UInt32(cells)
     within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
     spot, _ = elements.place(index, within)

@@ -17,6 +17,7 @@ from ...emission.elements import Elements, elements_of
 from ...emission.exitance import function_on
 from ...emission.of_emitter import surface_of
 from ...jit.batches import BATCH, batch_slices, numbered
+from ...jit.from_numpy import from_numpy
 from ...runtime.errors import SceneError
 
 CELLS = 2.5  # cells along the pupil over ⁴√lines: errors of cells and of pieces are then about equal for any blur
@@ -50,10 +51,10 @@ class Batch:
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Of every line of sight the element, its cuts and the line's number within the element."""
         row, number = numbered(self.lines)
-        row = mi.UInt32(row.astype(np.uint32))
-        index, cuts = (dr.gather(mi.UInt32, mi.UInt32(of.astype(np.uint32)), row) for of in (self.index, self.cuts))
+        row = from_numpy(mi.UInt32, row)
+        index, cuts = (dr.gather(mi.UInt32, from_numpy(mi.UInt32, of), row) for of in (self.index, self.cuts))
         # Entries beyond the last one gather 0, and an integer division by 0 ends the process.
-        return index, dr.maximum(cuts, 1), mi.UInt32(number.astype(np.uint32))
+        return index, dr.maximum(cuts, 1), from_numpy(mi.UInt32, number)
 
 
 @dataclass(frozen=True)
