@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
+SHORTER = 0.7  # of a step that failed, how long the next may be: one nearly as long would fail for the same reason
+
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
@@ -48,6 +50,13 @@ class LinearFit:
         scaled = np.linalg.solve(self.normal + damping * np.eye(len(self.normal)), self.right)
         return scaled / self.lengths, float(scaled @ (2 * self.right - self.normal @ scaled))
 
+    def damping_of(self, length: float, damping: float) -> float:
+        """λ, `damping` times the least power of 10 above 1 for which a step times the lengths is at most that long."""
+        while True:
+            damping *= 10
+            if not np.linalg.norm(self.step(damping)[0] * self.lengths) > length:
+                return damping
+
 
 class DampedSteps:
     """Steps each of which lowers Σ r², with a λ that follows their success.
@@ -62,7 +71,7 @@ class DampedSteps:
         self._damping = damping
 
     def lower(self, linear: LinearFit, attempt: Callable[[Array], T | None]) -> T | None:
-        """The result of the first `attempt` at a step (p,) that is not None, with a larger λ each time.
+        """The result of the first `attempt` at a step (p,) that is not None; after each other one λ is larger.
 
         None where no step is left: the fall of the next one is at most `end`. λ begins where it is more, if the step
         without damping is: along what the slopes determine weakly, a larger λ leaves nearly nothing of the step.
@@ -83,4 +92,4 @@ class DampedSteps:
                 self._damping = max(0.1 * self._damping, self._least)
                 self._longest = max(self._longest, 10 * np.abs(step).max())
                 return found
-            self._damping *= 10
+            self._damping = linear.damping_of(SHORTER * float(np.linalg.norm(step * linear.lengths)), self._damping)
