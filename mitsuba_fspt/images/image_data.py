@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -50,6 +50,9 @@ class ImageData:
         for name in ("flat_error", "dark_noise"):
             if (given := getattr(self, name)) is not None and not (given >= 0).all():
                 raise ImageError(f"image: '{name}' must be >= 0, got {given.min():g}. Give a standard deviation.")
+        if not isinstance(self.metadata, Mapping):
+            kind = type(self.metadata).__name__
+            raise ImageError(f"image: 'metadata' must be texts and numbers by name, got {kind}. Give a dict, or none.")
         metadata: Metadata = {"quantity": "power", "unit": "W"}
         metadata |= {k: v.item() if isinstance(v, np.generic) else v for k, v in self.metadata.items()}
         if (metadata["quantity"], metadata["unit"]) != ("power", "W"):

@@ -180,6 +180,11 @@ class TransportMatrix(LinearOperator):
         require_unmasked("transport: J", x, TransportError, "Fill it, for example with zeros.")
         return super().dot(x)
 
+    def _adjoint(self) -> LinearOperator:
+        return _Transpose(self)
+
+    _transpose = _adjoint  # of real numbers
+
     def _matvec(self, x: Array) -> Array:
         x = self._exitance(np.ravel(x))
         return np.concatenate([block.matrix @ x for block in self.blocks])
@@ -250,6 +255,36 @@ class TransportMatrix(LinearOperator):
         return f"TransportMatrix({views} views of {width} x {height} pixels, {self.shape[1]} columns on {self.on})"
 
 
+class _Transpose(LinearOperator):
+    """Tᵀ, from the power on the pixels of all views to the columns, as `T.T` and `T.H`."""
+
+    def __init__(self, matrix: TransportMatrix) -> None:
+        super().__init__(matrix.dtype, matrix.shape[::-1])
+        self._matrix = matrix
+
+    def dot(self, x: Any) -> Any:
+        """Tᵀ x, also as `T.T @ x`; TransportError where a masked array hides values, which SciPy would take."""
+        require_unmasked("transport: images", x, TransportError, "Fill it; pixels of 0 W count as dark.")
+        return super().dot(x)
+
+    def _matvec(self, x: Array) -> Array:
+        return self._matrix.rmatvec(x)
+
+    def _rmatvec(self, x: Array) -> Array:
+        return self._matrix.matvec(x)
+
+    def _matmat(self, x: Array) -> Array:
+        return self._matrix.rmatmat(x)
+
+    def _rmatmat(self, x: Array) -> Array:
+        return self._matrix.matmat(x)
+
+    def _adjoint(self) -> LinearOperator:
+        return self._matrix
+
+    _transpose = _adjoint
+
+
 class StrayMatrix(TransportMatrix):
     """T behind the point-spread function and the veiling glare of a detector, as `TransportMatrix.through` makes it.
 
@@ -297,11 +332,6 @@ class StrayMatrix(TransportMatrix):
         )
 
     # ------------------------------------------------------------------ SciPy's interface
-
-    def dot(self, x: Any) -> Any:
-        """T x, also as `T @ x`; TransportError where a masked array hides values, which SciPy would take."""
-        require_unmasked("transport: J", x, TransportError, "Fill it, for example with zeros.")
-        return super().dot(x)
 
     def _matvec(self, x: Array) -> Array:
         return self._spread(self.base.forward(np.ravel(x))).ravel()

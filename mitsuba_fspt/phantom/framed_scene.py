@@ -145,6 +145,11 @@ def scene_xml(
 
 def text_and_outline(phantom: str | os.PathLike[str], **settings: Any) -> tuple[str, Outline]:
     """Text of `scene_xml`, whose keywords these are, and the outline of the phantom."""
+    if not isinstance(phantom, (str, os.PathLike)):
+        raise SceneError(
+            f"scene: the phantom must be the name of a PLY file, got {type(phantom).__name__}. A scene names the file: "
+            "write it, as by phantom.write('phantom.ply')."
+        )
     path = Path(phantom)
     if "$" in str(path.absolute()):
         raise SceneError(f"scene: '{path}' has a $ in its path, which marks a parameter in a scene file. Rename it.")

@@ -113,6 +113,12 @@ def test_a_small_source_does_not_lose_digits():
     assert float(scaled.power[0, 0]) == pytest.approx(1e-42, rel=1e-6, abs=0)
 
 
+@pytest.mark.parametrize("metadata", [None, ["a"], "text"])
+def test_metadata_that_are_no_dict_are_refused(metadata):
+    with pytest.raises(ImageError, match=r"'metadata' must be texts and numbers by name, got \w+\. Give a dict"):
+        Image(np.ones((2, 3)), metadata=metadata)
+
+
 def test_images_cannot_be_written_into():
     """Also not by the caller's own array, such as a buffer of frames. Seen to fail: an image of 3 W in place of 1 W."""
     values = np.ones((2, 2))

@@ -336,6 +336,13 @@ def test_vectors_that_do_not_fit_are_refused(matrix):
             product(hidden)
     with pytest.raises(TransportError, match="images is a masked array that hides 504 values"):
         matrix.backward(np.ma.masked_all(matrix.image_shape))
+    rows = np.ones(matrix.shape[0])
+    for transpose in (matrix.T, matrix.H):
+        np.testing.assert_array_equal(transpose @ rows, matrix.rmatvec(rows))
+        np.testing.assert_array_equal(transpose @ rows[:, None], matrix.rmatvec(rows)[:, None])
+        assert transpose.T is matrix
+        with pytest.raises(TransportError, match="images is a masked array that hides 1 values"):
+            transpose @ np.ma.array(rows, mask=np.arange(len(rows)) == 3)
     with pytest.raises(TransportError, match=r"J must have the shape \(162,\)"):
         matrix.forward(np.ones(161))
     with pytest.raises(TransportError, match="J has 1 values that are NaN"):

@@ -95,6 +95,11 @@ def test_the_bounding_box_stays_in_the_middle(tmp_path):
     np.testing.assert_allclose(powers[1], powers[0], rtol=0, atol=2e-3 * powers[0].max())
 
 
+def test_a_phantom_that_is_no_file_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"must be the name of a PLY file, got Phantom\. .* write it"):
+        fspt.scene_xml(fspt.Phantom.read(box(tmp_path / "box.ply")))
+
+
 @pytest.mark.parametrize("face", [False, True])
 def test_exitance_on_vertices_or_faces_is_recognised(tmp_path, face):
     text = fspt.scene_xml(box(tmp_path / "box.ply", face=face), width=12, height=12, pixel_pitch=2)
