@@ -1,8 +1,8 @@
 """NumPy values as arrays of Dr.Jit that its kernels can read.
 
 Dr.Jit uses the memory of a NumPy array where it is, and its kernels read whole packets of entries, beyond the last one
-(Dr.Jit 1.5, LLVM). Where that memory ends with a page, the process ends by a segmentation fault: on average every
-hundredth large array whose length is no multiple of a packet.
+(Dr.Jit 1.5, LLVM). Where that memory ends with a page and the length is no multiple of a packet, the process ends by a
+segmentation fault.
 """
 
 from __future__ import annotations
