@@ -38,7 +38,10 @@ def fit_warnings(
     views = views_of(view_labels(problem.matrix), measurement.as_images(rows, signal)[0], rows, fit.sigma)
     free, design = ~problem.bounds | (fit.x > 0), problem.design(fit.x)
     slopes = csr_array((diags_array(1 / fit.sigma) @ design)[:, free])
-    solve = factor(csr_array(problem.hessian(design, fit.sigma, fit.weight)[free][:, free]))
+    if free.all():
+        _, solve = problem.normal(design, fit.sigma, fit.weight)
+    else:
+        solve = factor(csr_array(problem.hessian(design, fit.sigma, fit.weight)[free][:, free]))
     between, edge = problem.between(fit.x)
     common = hstack([common_errors(fit.numerical / fit.sigma, views), csr_array((between / fit.sigma)[:, None])])
     residual = (measurement.power[rows] + fit.correction - signal) / fit.sigma  # Eq. M.29

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,11 +24,12 @@ from .fit_settings import Settings
 from .fit_warnings import fit_warnings, tell_unconverged
 from .inversion import Inversion
 from .invert_options import Options, require_matrix
+from .kept_factor import KeptFactor
 from .measurement import Measurement
 from .mesh_error import MeshError
 from .mlem import mlem
 from .multipliers import Minima
-from .nonnegative import Accuracy, Solve, factor, minimise
+from .nonnegative import Accuracy, Solve, minimise
 from .outlook import is_hopeless
 from .seen_area import seen_share
 from .smoothness import Prior, Smoothness
@@ -129,6 +130,7 @@ class Problem:
     sensitivity : (points,) of the mesh to these pixels [mm²]
     bounded : (m,) unknowns that some pixel sees: J_n >= 0 holds there, the others only continue them
     factors : of the views, unknowns after those of J_n
+    kept : factor of the last `normal`
     """
 
     matrix: TransportMatrix
@@ -143,6 +145,7 @@ class Problem:
     prior: Prior
     settings: Settings
     factors: ViewFactors
+    kept: KeptFactor = field(default_factory=KeptFactor)
 
     @classmethod
     def of(
@@ -344,7 +347,7 @@ class Problem:
     def _improved(self, state: Fit, probes: Array, weight: float | None, accuracy: Accuracy) -> Fit:
         """Minimum for the variances and the weight of `state`, then its own variances, and its own weight for None."""
         design, count = self.design(state.x), self.surface.unknowns
-        normal, solve = self._normal(design, state.sigma, state.weight)
+        normal, solve = self.normal(design, state.sigma, state.weight)
         right = self._right(design, self.measurement.power[self.rows] + state.correction, state.sigma, state.weight)
         start = Minima(normal, solve, self.bounds, self.settings.columns).near(right[:, None], state.x)
         found = minimise(normal, right[:, None], start, self.bounds, solve, accuracy)
@@ -385,10 +388,10 @@ class Problem:
         slope = self.measurement.slope(self.rows, self.signal(state.x))
         return float(np.einsum("nk,nk->", probes, found) / count), slope * share
 
-    def _normal(self, design: csr_array, sigma: Array, weight: float) -> tuple[csr_array, Solve]:
-        """H + w Q with H = TᵀT/σ², and what solves it."""
+    def normal(self, design: csr_array, sigma: Array, weight: float, exact: bool = False) -> tuple[csr_array, Solve]:
+        """H + w Q with H = TᵀT/σ², and what solves it: `exact` for many solutions, which steps would take longer."""
         normal = self.hessian(design, sigma, weight)
-        return normal, factor(normal)
+        return normal, self.kept.solve(normal, sigma, weight, (design, self.smoothness), exact)
 
     def hessian(self, design: csr_array, sigma: Array, weight: float) -> csr_array:
         """H + w Q with H = TᵀT/σ², T the design, and the unit variance of the factors of views."""
@@ -428,7 +431,7 @@ class Problem:
         if not count:
             return np.empty((self.surface.unknowns + self.factors.views, 0))
         design = self.design(fit.x)
-        normal, solve = self._normal(design, fit.sigma, fit.weight)
+        normal, solve = self.normal(design, fit.sigma, fit.weight, exact=True)
         minima = Minima(normal, solve, self.bounds, self.settings.columns * count)
         between = self.between(fit.x)[0]
         sizes = [min(self.settings.block, count - k) for k in range(0, count, self.settings.block)]

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from ..runtime.progress_bar import Progress
 from .fit_settings import Settings
 from .measurement import Measurement
+from .nonnegative import Solve
 from .surface import Surface
 from .transport_matrix import TransportMatrix
 
@@ -69,5 +70,7 @@ class Problem(Protocol):
     def design(self, x: Array, /) -> csr_array: ...
 
     def hessian(self, design: csr_array, sigma: Array, weight: float, /) -> csr_array: ...
+
+    def normal(self, design: csr_array, sigma: Array, weight: float, /) -> tuple[csr_array, Solve]: ...
 
     def between(self, x: Array, /) -> tuple[Array, float]: ...
