@@ -47,8 +47,16 @@ def cylinder_end_on(tmp_path, height, size, distance=FOCUS, **optics):
     return world_scene(shape, sensor=lens(size, 0.5, distance, **optics))
 
 
+@pytest.fixture(scope="module")
+def flat_end(tmp_path_factory):
+    """Rows of pixels that the upper end of a cylinder crosses, and their image by elements of the surface."""
+    scene = cylinder_end_on(tmp_path_factory.mktemp("flat_end"), 8, (16, 16), f_number=2.8)
+    look_at_crop(scene, 0, 2, 16, 3)
+    return scene, by_elements(scene, rtol=1e-3)
+
+
 @pytest.mark.parametrize("rtol", [1e-3, 1e-2])
-def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(tmp_path, rtol):
+def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(flat_end, rtol):
     """An end that the lens sees edge-on: the sharp edge of the side, and nothing but the curve of the rim behind it.
     The rim before the virtual detector plane and that behind it are edges of opposite blur.
 
@@ -56,12 +64,10 @@ def test_the_flat_end_of_a_cylinder_along_a_row_of_pixels(tmp_path, rtol):
     fail, with 2 % of the brightest pixel missing at 0.1 % stated, where estimates of transects at a sharp edge were
     left out; at `rtol` 0.01, 2.2 % at 0.2 %, without the light of surfaces edge-on in the error of few transects.
     """
-    scene = cylinder_end_on(tmp_path, 8, (16, 16), f_number=2.8)
-    look_at_crop(scene, 0, 2, 16, 3)
-    images = [fspt.render(scene, rtol=rtol), by_elements(scene, rtol=1e-3)]
-    off = np.abs(images[0].power - images[1].power)
-    assert (off <= images[0].error + images[1].error).all()
-    assert images[0].error.max() < 2 * rtol * images[0].power.max()
+    scene, other = flat_end
+    image = fspt.render(scene, rtol=rtol)
+    assert (np.abs(image.power - other.power) <= image.error + other.error).all()
+    assert image.error.max() < 2 * rtol * image.power.max()
 
 
 def test_an_outline_behind_the_virtual_detector_plane_of_a_body_before_it(tmp_path):
@@ -117,7 +123,7 @@ def checker():
     body = {"type": "sphere", "radius": 10.0, "emitter": {"type": "fspt_surface", "exitance": board}}
     optics = {"focal_length": 50.0, "f_number": 4.0, "magnification": None, "focus_distance": 190.0}
     scene = world_scene(body, sensor=lens((96, 64), 0.2, 200.0, **optics))
-    look_at_crop(scene, 54, 45, 4, 3)
+    look_at_crop(scene, 54, 45, 2, 2)
     return scene
 
 
@@ -129,9 +135,9 @@ def part_of(family, seed, crop):
 
 
 FINER = {
-    "checker": checker,
-    "cylinders": lambda: part_of("cylinders", 0, (2, 42, 16, 14)),
-    "plates": lambda: part_of("plates", 1, (0, 24, 12, 12)),
+    "checker": (checker, 3e-4),
+    "cylinders": (lambda: part_of("cylinders", 0, (2, 49, 8, 7)), 3e-4),
+    "plates": (lambda: part_of("plates", 1, (0, 24, 12, 12)), 1e-4),
 }
 
 
@@ -141,11 +147,12 @@ def test_a_finer_rtol_states_no_larger_error(name):
 
     A tenth more is allowed: where a level of transects changes the value by more than the error stated before, that
     error was too small, and a larger one is right ('plates': 2.8e-4 off at 2.1e-4 stated, then 0.7e-4 off at 2.2e-4).
-    Seen to fail on 'checker', by factors of up to 20, where lattices are given up as soon as they cannot reach `rtol`,
-    and on 'cylinders' where the last transects count even if those before have a smaller error.
+    Seen to fail on 'checker', by factors of up to 28, and on 'cylinders', by 3.4, where lattices are given up as soon
+    as they cannot reach `rtol`.
     """
-    scene, before = FINER[name](), None
-    for rtol in (1e-2, 1e-3, 1e-4):
+    made, finest = FINER[name]
+    scene, before = made(), None
+    for rtol in (1e-2, 1e-3, finest):
         image = fspt.render(scene, method="integral", rtol=rtol)
         if before is not None:
             least = np.maximum(1.1 * before.error, 1.0001 * rtol * image.power.max())
@@ -154,19 +161,30 @@ def test_a_finer_rtol_states_no_larger_error(name):
 
 
 @pytest.mark.parametrize(
-    ("family", "seed", "rtol", "pixels"),
+    ("family", "seed", "rtol", "crop", "pixels"),
     [
-        pytest.param("bitmaps", 103, 1e-2, [(40, 33), (40, 34)], id="texels in focus"),
-        pytest.param("meshes", 105, 1e-2, [(29, 31)], id="corner of a mesh"),
-        pytest.param("bitmaps", 105, 1e-2, [(4, 14), (4, 15), (4, 18)], id="edges of texels along sides of pixels"),
-        pytest.param("bitmaps", 2, 1e-3, [(36, 54)], id="texels whose steps are no jumps"),
-        pytest.param("plates", 112, 1e-3, [(19, 10)], id="edge along the transects"),
-        pytest.param("boxes", 122, 1e-3, [(36, 14)], id="edge of a box along the transects"),
-        pytest.param("exit laws edge-on", 26, 1e-3, [(42, 10), (43, 10), (44, 10)], id="end between two edges"),
+        pytest.param("bitmaps", 103, 0.0327, (30, 37, 8, 5), [(40, 33), (40, 34)], id="texels in focus"),
+        pytest.param("meshes", 105, 0.013, (28, 26, 7, 7), [(29, 31)], id="corner of a mesh"),
+        pytest.param(
+            "bitmaps", 105, 0.01, (11, 1, 8, 4), [(4, 14), (4, 15), (4, 18)], id="edges of texels along sides of pixels"
+        ),
+        pytest.param("bitmaps", 2, 1.57e-3, (51, 33, 7, 7), [(36, 54)], id="texels whose steps are no jumps"),
+        pytest.param("plates", 112, 1e-3, (7, 16, 7, 7), [(19, 10)], id="edge along the transects"),
+        pytest.param("boxes", 122, 1e-3, (6, 28, 17, 10), [(36, 14)], id="edge of a box along the transects"),
+        pytest.param(
+            "exit laws edge-on",
+            26,
+            5.72e-3,
+            (7, 39, 7, 9),
+            [(42, 10), (43, 10), (44, 10)],
+            id="end between two edges",
+        ),
     ],
 )
-def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, seed, rtol, pixels):
+def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, seed, rtol, crop, pixels):
     """Pixels with several edges, on which two levels agree, against the float64 reference: within the stated error.
+
+    In the crop window of each `rtol` is 0.01 or 0.001 of the brightest pixel of the whole image.
 
     Seen to fail with an error of transects that falls as n^(-3/2) everywhere (up to 1.8 times that stated), with
     elements of the surface whose errors along a pixel's side are taken for independent (up to 6.3 times), without
@@ -174,13 +192,13 @@ def test_the_error_bounds_the_error_where_two_levels_agree_by_chance(family, see
     a jump (1.7 times), and with one edge in an interval of the scan that meets a third body (5 times).
     """
     made = random_scene(family, seed)
-    image = fspt.render(made.scene(), method="integral", rtol=rtol, pixel=made.reference.pixel)
+    scene = made.scene()
+    look_at_crop(scene, *crop)
+    image = fspt.render(scene, method="integral", rtol=rtol, pixel=made.reference.pixel)
     peak = image.power.max()
-    left, top = made.crop[:2]
-    index = np.array(pixels)
-    goal = np.full(len(index), 0.1 * rtol * peak)
-    true, uncertain = made.reference.power(index + np.array([top, left]), goal, most=2048)
-    rows, columns = index.T
+    goal = np.full(len(pixels), 0.1 * rtol * peak)
+    true, uncertain = made.reference.power(np.array(pixels), goal, most=2048)
+    rows, columns = (np.array(pixels) - np.array([crop[1], crop[0]])).T
     assert (uncertain < 0.5 * rtol * peak).all()
     assert (np.abs(image.power[rows, columns] - true) <= image.error[rows, columns] + uncertain).all()
 
@@ -211,16 +229,18 @@ def test_many_steps_between_two_jumps_are_in_the_error(tmp_path):
 
 def test_light_too_weak_for_the_search_is_in_the_error():
     """A dim spot 0.27 pixels wide behind the virtual detector plane; the surface form, which meets all of it, is
-    the reference.
+    the reference. Its weak light, which changes by less than 1e-3 from `rtol` 1e-2 to 1e-3, is within the other's error
+    alone.
 
     Seen to fail with the weak light left out: 62 pixels of 0 W with an error of 0.
     """
     z = 240.0
     spot = disk(z, 0.27 * SIDE * z / FOCUS / 2, x=-10.0) | {"emitter": {"type": "fspt_surface", "exitance": 0.05}}
     of = camera_scene(disk(FOCUS, 5.0, x=8.0), spot, crop=(14, 11, 20, 10))
-    image, truth = (fspt.render(of, method="integral", rtol=1e-3, domain=domain) for domain in ("pupil", "surface"))
-    assert np.count_nonzero((truth.power > 0) & (truth.power < 2e-4 * truth.power.max())) > 30
-    assert (np.abs(image.power - truth.power) <= image.error + truth.error).all()
+    image, truth = fspt.render(of, rtol=1e-3), fspt.render(of, rtol=3e-3, domain="surface")
+    weak = (truth.power > 0) & (truth.power < 2e-4 * truth.power.max())
+    assert np.count_nonzero(weak) > 30
+    assert (np.abs(image.power - truth.power) <= image.error + np.where(weak, 0, truth.error)).all()
 
 
 def test_twelve_nodes_where_j_n_is_rough(tmp_path):
@@ -256,8 +276,8 @@ def test_a_corner_between_all_lines_of_sight(tmp_path):
     path = tmp_path / "box.xml"
     path.write_text(fspt.scene_xml(tmp_path / "box.ply", f_number=1.8, width=192, height=192))
     scene = fspt.load(path, view=200)
-    look_at_crop(scene, 8, 118, 12, 16)
-    image, other = fspt.render(scene, rtol=1e-2), by_elements(scene, rtol=3e-3)
+    look_at_crop(scene, 8, 122, 12, 8)
+    image, other = fspt.render(scene, rtol=1e-2), by_elements(scene, rtol=1e-2)
     assert "images of faces" in image.metadata["levels"]
     assert (np.abs(image.power - other.power) <= image.error + other.error).all()
 
@@ -270,12 +290,12 @@ def test_1024_transects_where_the_image_is_steep():
     """
     made = random_scene("meshes", 202)
     scene = made.scene()
-    look_at_crop(scene, 3, 13, 5, 5)
+    look_at_crop(scene, 4, 14, 3, 3)
     image = fspt.render(scene, rtol=1e-4, max_nodes=1 << 18)
     assert "1024 transects" in image.metadata["levels"]
     true, uncertain = made.reference.power([[15, 5]], np.array([5e-4 * image.power.max()]), most=1024)
-    assert abs(image.power[2, 2] - true[0]) <= image.error[2, 2] + uncertain[0]
-    assert image.error[2, 2] < 3e-3 * image.power.max()
+    assert abs(image.power[1, 1] - true[0]) <= image.error[1, 1] + uncertain[0]
+    assert image.error[1, 1] < 3e-3 * image.power.max()
 
 
 def test_pixels_beyond_rtol_are_counted(run, tmp_path):
