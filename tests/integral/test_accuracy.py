@@ -207,7 +207,7 @@ def test_pixels_beside_a_crop_window_are_not_refined():
     """
     body = sphere(240.0, 8.0, 1.0)
     field, pixel = (camera_scene(body, f_number=1.4, crop=crop) for crop in ((4, 4, 32, 24), (20, 10, 1, 1)))
-    whole, part = fspt.render(field, rtol=1e-3), fspt.render(pixel, rtol=1e-3)
+    whole, part = fspt.render(field, rtol=3e-3), fspt.render(pixel, rtol=3e-3)
     np.testing.assert_allclose(part.power, whole.power[6:7, 16:17], rtol=2e-3)
     assert part.metadata["nodes"] < whole.metadata["nodes"] / 8
 
@@ -221,8 +221,9 @@ def test_tolerance_is_a_share_of_the_brightest_pixel_of_the_crop_window(depth, d
     """
     disc = disk(depth, 4.0, 6.0) | {"emitter": glow(10.0)}
     part = camera_scene(disc, sphere(FOCUS + 12, 4.0, -3.0), crop=(18, 0, WIDTH - 18, HEIGHT))
-    image = fspt.render(part, rtol=1e-2, domain=domain)
-    assert image.error.max() <= 1e-2 * image.power.max()
+    rtol = 1e-2 if domain == "pupil" else 3e-2
+    image = fspt.render(part, rtol=rtol, domain=domain)
+    assert image.error.max() <= rtol * image.power.max()
 
 
 @pytest.mark.parametrize("pixel", ["centre", "area"])
@@ -304,7 +305,7 @@ def test_ripples_finer_than_the_blur_are_seen(angle, rtol):
     depth, radius = 120.0, FOCAL / 5.6
     blur = radius * (FOCUS - depth) / FOCUS  # on the sheet
     wave, pitch = 4 / blur, 0.2
-    x, y, width, height = crop = (12, 10, 7, 4)
+    x, y, width, height = crop = (12, 10, 4, 3)
     sheet = camera_scene(ripples(depth, wave, angle), pixel_pitch=pitch, crop=crop)
     image = fspt.render(sheet, rtol=rtol, pixel="centre")
     expected = rippled_power(depth, wave, angle, radius, pitch / MAGNIFICATION)[y : y + height, x : x + width]

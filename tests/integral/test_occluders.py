@@ -33,19 +33,19 @@ def seen_past(glowing, dark, f_number, dim):
 
 
 @cache
-def power_past(glowing, dark, f_number):
+def power_past(glowing, dark, f_number, nodes):
     """Power [W] on every pixel, (h, w)."""
     camera = ReferenceCamera(55.0, f_number, FOCUS, PITCH, WIDTH, HEIGHT)
     disks = Disk(dark[:3], dark[3], 0.0), Disk(glowing[:3], glowing[3])
-    power, error = truth(camera, *disks, nodes=1 << 14)
+    power, error = truth(camera, *disks, nodes=nodes)
     assert error.max() < COUNTED * power.max()
     return power
 
 
-PAST = [
-    ((0.0, 0.0, 149.6, 2.5), (0.0, 3.0, 95.1, 5.0), 1.4),
-    ((3.5, -0.5, 149.6, 3.0), (2.0, 3.9, 95.1, 5.5), 1.4),
-    ((-0.3, 2.7, 149.2, 4.8), (1.3, 0.7, 95.9, 6.1), 5.6),
+PAST = [  # glowing and dark disk, f-number, nodes of the reference
+    ((0.0, 0.0, 149.6, 2.5), (0.0, 3.0, 95.1, 5.0), 1.4, 1 << 13),
+    ((3.5, -0.5, 149.6, 3.0), (2.0, 3.9, 95.1, 5.5), 1.4, 1 << 12),
+    ((-0.3, 2.7, 149.2, 4.8), (1.3, 0.7, 95.9, 6.1), 5.6, 1 << 14),
 ]
 # Of the first the dim disk sends its light from the surface, at 20000 lines a pixel as well as at 200000.
 DIM = [(1e-7, PAST[0], 20_000), (1e-7, PAST[1], 200_000)]
@@ -58,7 +58,7 @@ def test_light_past_a_dark_disk_arrives(disks, dim, max_nodes):
     which pass by the dark disk here and there, 0.35 of the peak shines through it. A disk that glows ever so little
     changes nothing: it settles no pixel either.
     """
-    scene, expected = seen_past(*disks, dim), power_past(*disks)
+    scene, expected = seen_past(*disks[:3], dim), power_past(*disks)
     image = fspt.render(scene, rtol=2e-2, max_nodes=max_nodes)
     off = np.abs(image.power - expected)
     assert image.error.max() < 0.03 * expected.max()
@@ -104,7 +104,7 @@ def test_narrow_light_before_a_dark_plate_that_hides_a_wide_body():
     parameters = mi.traverse(scene)
     parameters["shape_0.to_world"] = mi.Transform4f(np.array((at([0, 0, 190]) @ turned.scale(40)).matrix))
     parameters.update()
-    assert fspt.render(scene, rtol=5e-3).power.sum() == pytest.approx(light, rel=1e-2)
+    assert fspt.render(scene, rtol=1e-2).power.sum() == pytest.approx(light, rel=1e-2)
 
 
 def test_light_beside_a_dark_cylinder_is_found_along_its_outline_too():

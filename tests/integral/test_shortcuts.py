@@ -76,12 +76,12 @@ def test_a_shortcut_changes_no_pixel_by_a_tenth_of_rtol(name, tmp_path, monkeypa
     monkeypatch.setattr("mitsuba_fspt.integral.pupil.interpolated.FEWEST", 32)
     build, domain = CASES[name]
     scene = build(tmp_path / "body.ply")
-    rtol = RTOL if domain == "surface" or name == "smooth blocks" else 1e-3
+    rtol = 3 * RTOL if name == "smooth blocks" else RTOL if domain == "surface" else 1e-3
     short, long = solved(scene, domain, rtol=rtol), solved(scene, domain, [name], rtol=rtol)
     assert found(short, name)
     assert not found(long, name)
     # What lies between blocks is in the error that is asked for; pixels outside take part in the choice of a level.
-    most = rtol if name in ("smooth blocks", "outside") else rtol / 10
+    most = {"smooth blocks": RTOL, "outside": rtol}.get(name, rtol / 10)
     assert np.abs(short.power - long.power).max() <= most * long.power.max()
     assert short.rays < long.rays or name in ("specular", "record", "occlusion")
 
@@ -226,7 +226,7 @@ def test_explain_measures_what_each_shortcut_saves():
     assert one.lines_saved is None
     assert by_what["J_n look-ups"].left_out
     assert SHORTCUTS["occlusion"] not in by_what  # the surface form's own
-    other = fspt.explain(world_scene(ball()), rtol=RTOL, domain="surface")
+    other = fspt.explain(world_scene(ball(), sensor=lens(8, 1.6)), rtol=0.3, domain="surface")
     assert SHORTCUTS["occlusion"] in {row.what for row in other}
 
 

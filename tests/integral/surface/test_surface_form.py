@@ -56,9 +56,9 @@ def test_the_centre_of_a_disk_is_within_the_error():
     Expected: the pupil form within both errors. Seen to fail on 12 pixels, 0.7 rtol off at 0.2 stated, where the error
     that the number of elements leaves is not stated.
     """
-    scene = camera_scene(disk(FOCUS, 5.0, x=8.0), crop=(7, 13, 6, 6))
+    scene = camera_scene(disk(FOCUS, 5.0, x=8.0), crop=(8, 14, 4, 4))
     image = fspt.render(scene, method="integral", rtol=3e-3, domain="surface")
-    truth = fspt.render(scene, method="integral", rtol=1e-4)
+    truth = fspt.render(scene, method="integral", rtol=1e-3)
     assert (np.abs(image.power - truth.power) <= image.error + truth.error).all()
     assert image.error.max() < 3e-3 * image.power.max()
 
@@ -105,8 +105,8 @@ def test_a_shadows_border_lies_where_lines_of_sight_find_it():
     far = 2000.0
     ball = sphere(150.0, 4.0, far + 3) | {"emitter": glow(0.01)}
     place = mi.ScalarTransform4f().translate([far, 0, 0])
-    crop = (12, 9, 7, 5)  # of the disk's upper half, and the border on it
-    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place, crop=crop), rtol=1e-2)
+    crop = (12, 9, 4, 5)  # of the disk's upper half, and the border on it
+    surface, pupil = both(camera_scene(disk(175.0, 9.0, far, tilt=30), ball, to_world=place, crop=crop), rtol=2e-2)
     np.testing.assert_allclose(surface.power, pupil.power, atol=2e-2 * pupil.power.max())
     np.testing.assert_allclose(surface.power.sum(), pupil.power.sum(), rtol=1e-3)
 
@@ -152,7 +152,7 @@ def test_same_bits_in_every_run():
     ids=lambda lens: lens.get("model", "diaphragm off the lens"),
 )
 def test_every_model_of_the_lens(lens):
-    surface, pupil = both(camera_scene(sphere(180.0, 8.0, 3.0, -2.0), crop=QUARTER, **lens))
+    surface, pupil = both(camera_scene(sphere(180.0, 8.0, 3.0, -2.0), crop=(6, 12, 11, 3), **lens))  # limb and middle
     np.testing.assert_allclose(surface.power, pupil.power, atol=RTOL * pupil.power.max())
 
 
@@ -381,8 +381,9 @@ def test_no_pixel_is_dark_because_the_first_lines_of_sight_pass_it_by(tmp_path):
 def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     """Disks of a tenth of a pixel's width, three times as bright as the wall in focus behind them.
 
-    Expected: rtol against what they cover and what they add. Seen to fail, by 3.6e-3 of the brightest pixel, where a
-    face that is wider than the image counts as if all its light fell on one pixel, which rtol then is counted from.
+    Expected: half of rtol against what they cover and what they add. Seen to fail, by 3.6e-3 of the brightest pixel,
+    where a face that is wider than the image counts as if all its light fell on one pixel, which rtol then is counted
+    from.
     """
     pitch = 0.5
     wall = {"type": "rectangle", "to_world": mi_turned(0, 0, 180.0, 6.0)}
@@ -394,7 +395,7 @@ def test_a_spot_on_a_wall_of_two_faces_adds_its_light(domain):
     expected = filled(side=pitch, nodes=2, radius=55 / 8, distance=180.0)[13:19, 16:24]
     for x, y in spots:
         expected[int(3 - y / pitch), int(4 - x / pitch)] *= 1 + 2 * np.pi * 0.1**2
-    image = fspt.render(of, domain=domain, rtol=2e-3)
+    image = fspt.render(of, domain=domain, rtol=4e-3)
     assert np.abs(image.power - expected).max() < 2e-3 * expected.max()
 
 
