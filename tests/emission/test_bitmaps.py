@@ -75,7 +75,7 @@ def test_texels_of_half_a_pixel_reach_rtol():
     """In focus through a small stop, against the lit share of every pixel, counted at 400 x 400 points.
 
     Lit texels are narrow light, whose spread over pixels from texels settles slowly where their edges are slanted. Seen
-    to fail (47 pixels above rtol) without lattices on the pixels that the surface form does not settle.
+    to fail (6 of 6 pixels above rtol) without lattices on the pixels that the surface form does not settle.
     """
     texels, half, tilt, (width, height) = 18, 3.0, np.radians(20.0), (12, 10)
     bright = (np.random.default_rng(0).random((texels, texels)) < 0.15).astype(np.float32)
@@ -85,10 +85,10 @@ def test_texels_of_half_a_pixel_reach_rtol():
     rectangle = {"type": "rectangle", "to_world": place.scale([half, half, 1]), "emitter": emitter}
     optics = {"f_number": 64.0, "magnification": None, "focus_distance": 180.0, "to_world": None}
     scene = world_scene(rectangle, sensor=lens(size=(width, height), pitch=0.572, **optics))
-    look_at_crop(scene, 3, 2, 5, 4)
+    look_at_crop(scene, 3, 2, 3, 2)
     image, camera = fspt.render(scene, max_nodes=1 << 22), scene.sensors()[0].camera
 
-    within, rows, columns = (np.arange(400) + 0.5) / 400 - 0.5, np.arange(2, 6), np.arange(3, 8)
+    within, rows, columns = (np.arange(400) + 0.5) / 400 - 0.5, np.arange(2, 4), np.arange(3, 6)
     y, x = (
         camera.virtual_pitch * ((n - 1) / 2 - which[:, None] - within).ravel()
         for n, which in ((height, rows), (width, columns))
@@ -98,7 +98,7 @@ def test_texels_of_half_a_pixel_reach_rtol():
     on = (u > 0) & (u < 1) & (v > 0) & (v < 1)
     column, row = (np.clip((texels * c).astype(int), 0, texels - 1) for c in (u, v))
     light = bright[row, column] * on / (1 + (x**2 + y**2) / 180**2) ** 2
-    truth = camera.etendue / np.pi * light.reshape(4, 400, 5, 400).mean(axis=(1, 3))
+    truth = camera.etendue / np.pi * light.reshape(2, 400, 3, 400).mean(axis=(1, 3))
     assert (image.error <= 1e-3 * image.power.max()).all()
     assert np.abs(image.power - truth).max() <= 1.3e-3 * truth.max()  # 3e-4 of it for the counting
 

@@ -77,7 +77,7 @@ def test_the_same_light_as_by_surface_records_and_by_single_lines_of_sight(name,
     def found(*without, most):
         for limit in limits:
             monkeypatch.setattr(f"mitsuba_fspt.integral.pupil.{limit}", most)
-        return solved(scene, *without, rtol=1e-2)
+        return solved(scene, *without, rtol=3e-2 if name == "several" else 1e-2)
 
     table = found(most=np.inf)
     if name in ("several", "inside out", "ball", "tube"):

@@ -282,13 +282,13 @@ def test_last_flight_is_the_same_in_both_domains():
 def test_fluence_updated_by_itself_is_followed():
     """Expected: the image of a scene that had it from the start. Seen to fail where J_n alone is evaluated again."""
     scene, emitter = glowing_sphere(last_flight(*STEEP))
-    fspt.render(scene, method="integral", rtol=1e-2)
+    fspt.render(scene, method="integral", rtol=0.3)
     turned = sloping(1.0, (-0.1, 0.05, 0.1))
     values = mi.traverse(emitter.surface.law.fluence)
     values["data"] = mi.traverse(mi.load_dict(turned))["data"]
     values.update()
     anew = glowing_sphere(last_flight(1.0, (0, 0, 0), fluence=turned))[0]
-    pictures = [fspt.render(each, method="integral", rtol=1e-2).power for each in (scene, anew)]
+    pictures = [fspt.render(each, method="integral", rtol=0.3).power for each in (scene, anew)]
     np.testing.assert_array_equal(*pictures)
 
 

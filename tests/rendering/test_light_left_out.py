@@ -83,7 +83,7 @@ def test_mirrors_beyond_the_longest_path_are_reported():
     truth = 1 - straight.total_power / all_of_it.total_power
     assert straight.metadata["light_left_out"] == pytest.approx(truth, abs=0.02)
     assert "shape_1" in straight.metadata["warnings"]
-    assert fspt.compare(fspt.render(scene), straight).light_of_one.image == "calculated"
+    assert fspt.compare(fspt.render(scene, rtol=1e-2), straight).light_of_one.image == "calculated"
 
 
 @pytest.mark.parametrize(
