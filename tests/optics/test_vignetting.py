@@ -123,8 +123,8 @@ def test_the_tolerance_is_that_of_the_dimmed_image(tmp_path):
     np.save(tmp_path / "half.npy", shares)
     bright = {**disk(180.0, 2.0, 3.0), "emitter": glow(20.0)}  # on the dimmed half: +x is to the left
     scene = camera_scene(bright, disk(181.0, 2.0, -3.0), vignetting=str(tmp_path / "half.npy"), crop=CROP)
-    image = fspt.render(scene, method="integral", rtol=1e-2)
-    assert image.error.max() <= 1e-2 * image.power.max()
+    image = fspt.render(scene, method="integral", rtol=3e-2)
+    assert image.error.max() <= 3e-2 * image.power.max()
 
 
 def test_the_matrix_and_the_units_have_it(patches, tmp_path, caplog):
@@ -198,7 +198,7 @@ def test_derivatives_have_it(curve):
         f'<integrator type="fspt_integral"/>{text}{BALL_XML}</scene>'
         for text in (LENS_XML.replace('<transform name="to_world">', more), LENS_XML)
     )
-    one, other = (fspt.derivatives(text, ["f_number"], rtol=5e-4)["f_number"] for text in (dim, clear))
+    one, other = (fspt.derivatives(text, ["f_number"], rtol=2e-3)["f_number"] for text in (dim, clear))
     x, y = (np.arange(8) - 3.5) * 0.8, (np.arange(6) - 2.5)[:, None] * 0.8
     shares = np.interp(np.hypot(x, y), HEIGHTS, SHARES)
     assert np.abs(other.value).max() > 0

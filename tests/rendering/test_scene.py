@@ -296,9 +296,9 @@ def test_plain_mitsuba_renders_monte_carlo_in_the_same_unit(tmp_path, method):
     """A scene file with a stock integrator, by mi.load_file and mi.render; expected within the noise of fspt.render."""
     integrator = f'<integrator type="{method}"><integer name="max_depth" value="1"/></integrator>'
     path = write_scene(tmp_path / "s.xml", integrator=integrator)
-    image = fspt.render(fspt.load(path), spp=4000)
+    image = fspt.render(fspt.load(path), spp=1000)
     assert image.metadata["method"] == method
-    plain = np.array(mi.render(mi.load_file(str(path)), spp=4000))[..., 0]
+    plain = np.array(mi.render(mi.load_file(str(path)), spp=1000))[..., 0]
     assert np.all(np.abs(plain - image.power) < 7 * image.error + 1e-6 * image.power.max())
     integral = fspt.render(fspt.load(path), method="integral")
     assert image.power.sum() == pytest.approx(integral.power.sum(), abs=5 * np.linalg.norm(image.error))
@@ -372,12 +372,12 @@ def graded(tmp_path):
 def test_updating_vertex_values_changes_every_method(graded):
     """All three, of which the particle tracer also has to sample anew."""
     scene, parameters = graded
-    methods = ({}, {"method": "path", "spp": 128}, {"method": "ptracer", "spp": 1024})
+    methods = ({"rtol": 1e-2}, {"method": "path", "spp": 128}, {"method": "ptracer", "spp": 1024})
     before = [fspt.render(scene, **options) for options in methods]
     key = "shape_0.vertex_exitance"
     parameters[key] = mi.Float(np.where(np.array(parameters[key]) > 5e-3, 5.0, 1.0) * np.array(parameters[key]))
     parameters.update()
-    truth = fspt.render(scene)
+    truth = fspt.render(scene, rtol=1e-2)
     assert truth.power.sum() > 2 * before[0].power.sum()
     for options, old in zip(methods[1:], before[1:], strict=True):
         image = fspt.render(scene, **options)
