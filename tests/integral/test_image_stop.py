@@ -98,7 +98,7 @@ def test_pixels_beside_the_stop_are_dark_and_not_computed():
     inside, beside = pixels(STOP)
     assert beside.sum() > 500
     assert inside.sum() > 400
-    for options in ({}, {"domain": "surface"}, {"method": "path", "spp": 16}, {"method": "ptracer", "spp": 16}):
+    for options in ({}, {"domain": "surface"}, {"method": "path", "spp": 4}, {"method": "ptracer", "spp": 4}):
         image = fspt.render(camera_scene(disk(SHARP, 200.0), image_stop_diameter=STOP), **options)
         for plane in (image.power, image.error, image.coverage):
             assert np.all(plane[beside] == 0), options

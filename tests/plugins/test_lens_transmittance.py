@@ -17,8 +17,8 @@ TAU = 0.37
 METHODS = {
     "pupil": {"method": "integral", "rtol": 1e-3},
     "surface": {"method": "integral", "domain": "surface", "rtol": 5e-2},
-    "path": {"method": "path", "spp": 16, "seed": 1},
-    "ptracer": {"method": "ptracer", "spp": 16, "seed": 1},
+    "path": {"method": "path", "spp": 4, "seed": 1},
+    "ptracer": {"method": "ptracer", "spp": 4, "seed": 1},
 }
 
 
