@@ -229,8 +229,8 @@ def test_many_steps_between_two_jumps_are_in_the_error(tmp_path):
 
 def test_light_too_weak_for_the_search_is_in_the_error():
     """A dim spot 0.27 pixels wide behind the virtual detector plane; the surface form, which meets all of it, is
-    the reference. Its weak light, which changes by less than 1e-3 from `rtol` 1e-2 to 1e-3, is within the other's error
-    alone.
+    the reference. Its weak light, which is far more exact than stated (from `rtol` 1e-2 to 1e-3 it changes by less
+    than 1e-3, but for pixels at the rim of the blur disc), is within the other's error alone.
 
     Seen to fail with the weak light left out: 62 pixels of 0 W with an error of 0.
     """
