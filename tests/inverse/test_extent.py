@@ -15,6 +15,7 @@ from sphere_views import noisy
 import mitsuba_fspt as fspt
 from mitsuba_fspt.inverse.extent import ExtentSettings, Profile
 from mitsuba_fspt.inverse.source_fit import LocationSettings
+from mitsuba_fspt.inverse.source_grid import SourceGrid
 from mitsuba_fspt.inverse.surface import Surface
 from mitsuba_fspt.optics.media import Source
 from mitsuba_fspt.optics.shapes import Sphere
@@ -63,7 +64,13 @@ class Case:
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, mono):
-    with tetrahedra_made_once():
+    """The bands one after the other, as threads for steps of 1 ms cost a quarter of the time, and no density.
+
+    `test_bands` in test_locate.py has the threads, `test_density` the density.
+    """
+    with tetrahedra_made_once(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mitsuba_fspt.inverse.band_images.in_threads", lambda *of_bands: list(map(*of_bands)))
+        patch.setattr(SourceGrid, "density", lambda grid, _: np.zeros(len(grid.mesh.vertices)))
         yield Case(tmp_path_factory.mktemp("cylinder"))
 
 

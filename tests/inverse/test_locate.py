@@ -62,6 +62,12 @@ def case(tmp_path_factory, mono):
         yield Case(tmp_path_factory.mktemp("cylinder"))
 
 
+@pytest.fixture(autouse=True)
+def no_density(monkeypatch):
+    """No density but in the results that several tests share, `plain` and `two`, which are made before."""
+    monkeypatch.setattr(SourceGrid, "density", lambda grid, _: np.zeros(len(grid.mesh.vertices)))
+
+
 @pytest.fixture(scope="module")
 def plain(case):
     """Result for `case.images(SOURCE)`."""
@@ -244,7 +250,7 @@ def test_coefficients_in_1_cm_are_told(case, caplog):
 
 def test_a_matrix_of_faces(case, plain):
     """J_n of a face is the mean of its corners: the same source as from vertices."""
-    matrix = fspt.transport(case.toml.with_suffix(".xml"), view=VIEWS, on="face", rtol=3e-3)
+    matrix = fspt.transport(case.toml.with_suffix(".xml"), view=VIEWS, on="face", rtol=3e-2)
     found = locate(case.described, matrix, case.images(SOURCE))
     whole = plain
     np.testing.assert_allclose(found.sources[0].position, whole.sources[0].position, atol=0.02)
@@ -263,7 +269,7 @@ def test_the_pose_in_the_scene_does_not_matter(case, tmp_path):
     turned = xml.replace('<rotate z="1"', pose + '<rotate z="1"')
     assert turned != xml
     (tmp_path / "turned.xml").write_text(turned)
-    matrix = fspt.transport(tmp_path / "turned.xml", view=VIEWS, rtol=3e-3)
+    matrix = fspt.transport(tmp_path / "turned.xml", view=[0, 90], rtol=3e-2)  # it makes the images, too
     surface = Surface.of(matrix)
     np.testing.assert_allclose(surface.vertices, case.surface.vertices, atol=1e-5)
     images = noisy(matrix, exact(case.surface.vertices, [SOURCE]), 1000, 0)
