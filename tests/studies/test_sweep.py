@@ -392,18 +392,21 @@ def test_a_point_that_kills_every_process_is_named(scene, monkeypatch):
 
 
 def test_an_error_in_a_process_comes_back_as_it_is(scene):
-    with pytest.raises(SceneError, match=r"^f_number=\d: fspt_integral: 'rtol' must be in \(0, 1\), got 3"):
-        fspt.sweep(scene, {"f_number": [4, 8]}, "o", jobs=2, rtol=3)
+    with pytest.raises(SceneError, match=r"^f_number=4: fspt_integral: 'rtol' must be in \(0, 1\), got 3"):
+        fspt.sweep(scene, {"f_number": [4]}, "o", jobs=2, rtol=3)
     assert not os.path.exists("o")
 
 
 def test_a_cluster_of_two_workers_one_of_them_killed(scene, tmp_path, serial):
-    """By its address; a worker is killed at its point. Seen to fail where both had finished all points by then."""
+    """By its address; a worker is killed at its point, of two. The other renders both: a third would load Mitsuba.
+
+    Seen to fail where both had finished all points by then.
+    """
     distributed = pytest.importorskip("distributed")
     killed = []
 
     def kill_one(what, share):
-        if share == 0.25:
+        if share == 0.5:
             (busy, *_) = [worker for worker, tasks in distributed.default_client().processing().items() if tasks]
             with suppress(OSError):
                 os.kill(distributed.default_client().run(os.getpid, workers=[busy])[busy], signal.SIGKILL)
@@ -413,10 +416,11 @@ def test_a_cluster_of_two_workers_one_of_them_killed(scene, tmp_path, serial):
     with distributed.LocalCluster(n_workers=2, **workers.LOCAL_CLUSTER, silence_logs=50) as cluster:
         with distributed.Client(cluster) as client:
             client.run(hold_all_but_the_first_point)
-        rows = fspt.sweep(scene, VALUES, "o", scheduler=cluster.scheduler_address, progress=kill_one)
+        values = VALUES | {"distance": DISTANCES[:1]}
+        rows = fspt.sweep(scene, values, "o", scheduler=cluster.scheduler_address, progress=kill_one)
     assert len(killed) == 1
-    assert [row.file.name for row in rows] == NAMES
-    assert_same_bits(tmp_path / "o", serial)
+    assert [row.file.name for row in rows] == NAMES[::2]
+    assert_same_bits(tmp_path / "o", {name: serial[name] for name in NAMES[::2]})
 
 
 def test_a_cluster_started_here(run, tmp_path, serial):
@@ -565,14 +569,18 @@ def test_ctrl_c_leaves_one_line_and_what_is_done(tmp_path, jobs):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_no_process_outlives_the_one_at_the_top(tmp_path, number):
-    """Each point would take minutes. Seen to fail: the workers went on with their points."""
+    """Each point would take minutes. Seen to fail: the workers went on with their points.
+
+    The signal that a process cannot catch meets two workers, of which one could keep the other's pipe open.
+    """
     slow = ["--method", "path", "--spp", "100000000", "--jobs", "2"]
-    command = [sys.executable, "-m", "mitsuba_fspt", "sweep", "s.xml", *DEFINE, "-o", "o", *slow]
+    define, busy = (DEFINE, 4) if number == signal.SIGKILL else (["-D", "f_number=8"], 2.5)
+    command = [sys.executable, "-m", "mitsuba_fspt", "sweep", "s.xml", *define, "-o", "o", *slow]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     deadline = time.monotonic() + 60
     workers: list[Path] = []
-    while time.monotonic() < deadline and sum(map(_seconds_of_work, workers)) < 4:
+    while time.monotonic() < deadline and sum(map(_seconds_of_work, workers)) < busy:
         time.sleep(0.1)
         workers = [Path(f"/proc/{child}") for child in children.read_text().split()]
     process.send_signal(number)
