@@ -142,7 +142,7 @@ def short(monkeypatch):
     monkeypatch.setattr(converge_methods, "PRIMES", (2, 17))
     monkeypatch.setattr(converge_methods, "MOST_POINTS", 1 << 16)
     monkeypatch.setattr(converge, "BURST", 0.01)
-    monkeypatch.setattr(converge, "REFERENCE_RTOL", {"pupil": (1e-4,), "surface": (0.1,)})
+    monkeypatch.setattr(converge, "REFERENCE_RTOL", {"pupil": (1e-3,), "surface": (0.1,)})
 
 
 @pytest.mark.usefixtures("mono", "short")
@@ -245,11 +245,12 @@ def test_raw_rays_are_as_many_as_asked_for():
 
 
 @pytest.mark.usefixtures("mono", "short")
-def test_reference_meets_the_closed_form_within_its_error():
+def test_reference_meets_the_closed_form_within_its_error(monkeypatch):
     """Rationale: a uniform disk that fills every cone has an image in closed form. Expected: within the stated error.
 
     The statement is no empty one: below 1e-5 of the peak.
     """
+    monkeypatch.setattr(converge, "REFERENCE_RTOL", {"pupil": (1e-4,), "surface": (0.1,)})
     scene = small_scenes.camera_scene(small_scenes.disk(FOCUS))
     made = converge.own_reference(scene, scene.sensors()[0], 1.0)
     truth = SIDE**2 * small_scenes.over_pixels(
