@@ -82,7 +82,7 @@ def exitances(on):
     return {"smooth": smooth, "decades": decades, "noisy": noisy}
 
 
-def disc_nodes(radius, rings=24, spokes=64):
+def disc_nodes(radius, rings=8, spokes=24):
     """Points (n, 2) of a disc and their areas (n,)."""
     node, weight = np.polynomial.legendre.leggauss(rings)
     rho, turn = radius * np.sqrt((node + 1) / 2), (np.arange(spokes) + 0.5) * 2 * np.pi / spokes
@@ -116,13 +116,13 @@ def collected_by_vertices(vertices, faces, cut=4):
 
 
 def test_sums_of_columns_are_form_factors_whatever_the_focus(tmp_path):
-    """Expected out of focus: ∫ φ_j f_S→pupil dS, to 1e-3 at rtol 3e-4 of each column that sends light.
+    """Expected out of focus: ∫ φ_j f_S→pupil dS, to 1e-3 at rtol 1e-3 of each column that sends light.
 
     A column seen by a rim of the pupil alone has so little light that it is compared with a percent of the largest.
     Seen to fail with cos⁴θ or cosθ_s dropped from the columns, 1/π twice, and u² replaced by a constant.
     """
     depth, bound = 150.0, 1e-3
-    matrix = fspt.transport(body_scene(tmp_path, depth=depth), rtol=3e-4)
+    matrix = fspt.transport(body_scene(tmp_path, depth=depth), rtol=RTOL)
     expected = collected_by_vertices(before_the_lens(BODY.vertices @ TURN.T, depth), BODY.faces)
     np.testing.assert_allclose(matrix.sensitivity, expected, rtol=bound, atol=bound * 0.01 * expected.max())
     assert expected.max() > 1e-3
@@ -216,7 +216,7 @@ def test_no_entry_is_lost_between_the_surface_form_and_lines_of_sight(tmp_path):
     path = write_ply(tmp_path / "ellipsoid.ply", body.vertices, body.faces, vertex=exitance)
     text = fspt.scene_xml(path, focal_length=50, f_number=1.8, width=192, height=192)
     scene = fspt.load(text, view=90)
-    look_at_crop(scene, 148, 82, 10, 10)
+    look_at_crop(scene, 148, 82, 10, 5)
     one, other = (fspt.transport(scene, rtol=rtol) for rtol in (1e-4, 3e-4))
     rows = [matrix.matrix.toarray() for matrix in (one, other)]
     lit = rows[0].sum(axis=1) > 0.1 * rows[0].sum(axis=1).max()
@@ -255,7 +255,7 @@ def test_faces_are_cut_along_the_edge_of_a_shadow():
     Seen to fail, by 1.9 rtol with ten times as much stated, where pieces of faces are lit or dark as a whole.
     """
     scene = random_scene("hidden ellipsoids", 6).scene()
-    look_at_crop(scene, 6, 46, 10, 10)
+    look_at_crop(scene, 8, 48, 6, 6)
     exitance = np.concatenate([shape_exitance(emitter) for emitter in scene.emitters()])
     image = fspt.render(scene, method="integral", rtol=RTOL / 2)
     matrix, peak = fspt.transport(scene, rtol=RTOL), image.power.max()
@@ -297,7 +297,7 @@ def test_a_column_alone_is_the_image_of_one_vertex(tmp_path):
         exitance = np.zeros(len(fine))
         exitance[vertex] = 1
         shine(scene, "vertex", exitance)
-        image = by_elements(scene, rtol=1e-2, max_nodes=1 << 14)
+        image = by_elements(scene, rtol=2e-2, max_nodes=1 << 14)
         column = matrix.forward(exitance)[0]
         peak = image.power.max()
         assert 0 < image.error.max() <= bound / 2 * peak, vertex
