@@ -99,6 +99,7 @@ def test_work_precision_computes_the_reference_once(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(work_precision, "mesh_truth", truth)
     monkeypatch.setattr(converge, "methods", four_nodes)
+    monkeypatch.setattr(converge, "BURST", 0.01)
     options = ["-o", str(tmp_path), "--truth", str(tmp_path / "new" / "truth.npz"), "--rounds", "1"]
     monkeypatch.setattr(sys, "argv", ["work_precision.py", *options])
     for _ in range(2):
