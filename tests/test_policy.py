@@ -108,16 +108,24 @@ def tree_of(name):
     return ast.parse((PACKAGE / name).read_text())
 
 
+@cache
+def nodes_of(name):
+    """All nodes of a file, which the rules go through one after the other."""
+    return list(ast.walk(tree_of(name)))
+
+
 def room_of(name):
     """First folder of a file; '' for those at the top."""
     return name.split("/")[0] if "/" in name else ""
 
 
-def at_run_time(tree):
-    """All nodes but those under `if TYPE_CHECKING:`."""
+def at_run_time(tree, outside_of=()):
+    """All nodes but those under `if TYPE_CHECKING:` and those of some kinds with all in them."""
     todo = [tree]
     while todo:
         node = todo.pop()
+        if isinstance(node, outside_of):
+            continue
         if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
             todo += node.orelse
             continue
@@ -137,7 +145,7 @@ def imported(nodes):
 def imported_rooms(name):
     """Rooms that a file imports from, those for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(tree_of(name)):
+    for node in nodes_of(name):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = folder[: len(folder) - node.level + 1] + (node.module.split(".") if node.module else [])
             if home:
@@ -165,7 +173,7 @@ def test_arrows_between_rooms_run_one_way():
 def imported_files(name):
     """Files of the package that a file imports from, inside functions and for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(tree_of(name)):
+    for node in nodes_of(name):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = folder[: len(folder) - node.level + 1] + (node.module.split(".") if node.module else [])
             for alias in node.names:
@@ -201,7 +209,7 @@ def test_every_listed_arrow_exists():
 def files_imported(name):
     """Files of the package that a file imports from, as paths without suffix, those for types alone included."""
     folder = name.split("/")[:-1]
-    for node in ast.walk(tree_of(name)):
+    for node in nodes_of(name):
         if isinstance(node, ast.ImportFrom) and node.level:
             home = [*folder[: len(folder) - node.level + 1], *(node.module.split(".") if node.module else [])]
             found = ["/".join(home), *("/".join([*home, alias.name]) for alias in node.names)]
@@ -282,7 +290,7 @@ def test_lens_and_surface_are_shells_whose_members_nobody_uses_below():
     members = members_of_plugins()
     assert members == {"camera", "prepare_model", "surface"}
     for name in (name for name in NAMES if room_of(name) in WITHOUT_PLUGINS):
-        for node in ast.walk(tree_of(name)):
+        for node in nodes_of(name):
             if isinstance(node, ast.Attribute) and node.attr in members:
                 holder = ast.unparse(node.value).rpartition(".")[2]
                 plugin = holder in ("sensor", "lens", "emitter") or holder.endswith("()")
@@ -305,7 +313,7 @@ def test_no_star_imports():
     assert not faults(
         lambda name: (
             f"line {node.lineno}"
-            for node in ast.walk(tree_of(name))
+            for node in nodes_of(name)
             if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names)
         )
     )
@@ -323,15 +331,12 @@ def test_nobody_imports_the_renderer_at_module_level():
     functions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
     # The sum over surface points is Dr.Jit code too, and is imported where it is needed.
     for name in (name for name in NAMES if room_of(name) not in DRJIT_ROOMS and "direct_summation" not in name):
-        module = tree_of(name)
-        inside = {id(n) for f in ast.walk(module) if isinstance(f, functions) for n in ast.walk(f)}
-        outer = [node for node in at_run_time(module) if id(node) not in inside]
-        assert not {"mitsuba", "drjit"} & set(imported(outer)), name
+        assert not {"mitsuba", "drjit"} & set(imported(at_run_time(tree_of(name), functions))), name
 
 
 def test_only_the_command_line_prints():
     for name in (name for name in NAMES if room_of(name) != "cli"):
-        for node in ast.walk(tree_of(name)):
+        for node in nodes_of(name):
             if isinstance(node, ast.Call):
                 printer = ast.unparse(node.func)
                 assert printer not in ("print", "typer.echo", "sys.stdout.write", "sys.stderr.write"), name
@@ -339,7 +344,7 @@ def test_only_the_command_line_prints():
 
 def test_input_is_not_checked_by_assert_nor_refused_by_a_bare_exception():
     for name in NAMES:
-        for node in ast.walk(tree_of(name)):
+        for node in nodes_of(name):
             assert not isinstance(node, ast.Assert), f"{name}, line {node.lineno}"
             if isinstance(node, ast.Raise) and node.exc is not None:
                 raised = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
@@ -350,7 +355,7 @@ def test_nobody_uses_the_private_names_of_another_file():
     """Neither `from .other import _name` nor `other._name` of a module imported from the package."""
     stems = {Path(other).stem for other in NAMES}
     for name in NAMES:
-        nodes = list(ast.walk(tree_of(name)))
+        nodes = list(nodes_of(name))
         taken = [alias for node in nodes if isinstance(node, ast.ImportFrom) and node.level for alias in node.names]
         modules = {alias.asname or alias.name for alias in taken} & stems
         assert not [alias.name for alias in taken if alias.name.startswith("_")], name
@@ -362,7 +367,7 @@ def test_nobody_uses_the_private_names_of_another_file():
 def test_plugins_load_nothing_in_their_constructors():
     """`mi.load_dict` there races with the other threads of Mitsuba's loader: see the tests of scenes."""
     for name in (name for name in NAMES if room_of(name) in DRJIT_ROOMS):
-        for node in ast.walk(tree_of(name)):
+        for node in nodes_of(name):
             if isinstance(node, ast.Call):
                 assert ast.unparse(node.func) not in ("mi.load_dict", "mi.load_file", "mi.load_string"), name
 
@@ -371,7 +376,7 @@ def test_files_and_functions_stay_short():
     """A file is one noun of up to some 500 lines."""
     for name in NAMES:
         assert len((PACKAGE / name).read_text().splitlines()) <= 520, name
-        for node in ast.walk(tree_of(name)):
+        for node in nodes_of(name):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < 60, f"{name}: {node.name}, line {node.lineno}"
 
