@@ -76,7 +76,7 @@ def test_slopes_are_those_of_whole_solutions(model, cases):
 
     Expected: within 0.2 % of the largest slope, of first and second order in the steps.
     """
-    mesh = cylinder_tetrahedra(5, 8, 2.0)
+    mesh = cylinder_tetrahedra(5, 8, 4.0)
     region = (mesh.vertices[mesh.cells].mean(axis=1)[:, 2] > 1).astype(int)
     mesh = replace(mesh, region=region)
     tissue = Tissue(mesh, MEDIA, model=model, repeated=True)
