@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import struct
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from small_scenes import BALL_XML, LENS_XML, write_ply, write_scene
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.cli import app
+from mitsuba_fspt.images import image
 from mitsuba_fspt.runtime.errors import ExitanceError, FsptError, ImageError, OpticsError, SceneError
 
 SQUARE = [(0, -3, -3), (0, 3, -3), (0, 3, 3), (0, -3, 3)]
@@ -461,26 +461,25 @@ def test_a_folder_that_may_not_be_written_is_refused_before_the_work(folder, ref
         fspt.Image(np.ones((2, 2))).write(folder / "locked.exr")
 
 
-def test_a_disk_full_half_way_leaves_the_old_file_and_nothing_else(tmp_path):
-    """From the moment of writing files may grow to 300 bytes, which no image fits into."""
+def test_a_disk_full_half_way_leaves_the_old_file_and_nothing_else(tmp_path, capfd, monkeypatch):
+    """While an image is written, files may grow to 300 bytes, which no image fits into."""
+    monkeypatch.chdir(tmp_path)
     write_scene(tmp_path / "s.xml")
     (tmp_path / "o.exr").write_bytes(b"the old one")
-    code = """
-import resource, signal, sys
-from mitsuba_fspt import cli
-from mitsuba_fspt.images import image
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-write = image.write_planes
-def write_to_full_disk(*arguments):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
-    write(*arguments)
-image.write_planes = write_to_full_disk
-sys.exit(cli.run(["render", "s.xml", "-o", "o.exr"]))
-"""
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 2, done.stderr
-    assert re.fullmatch(r"fspt: image file 'o\.exr': [^\n]+\. Make room or give another place for it\.\n", done.stderr)
-    assert done.stdout == ""
+    write, (limit, hard) = image.write_planes, resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def write_to_full_disk(*arguments):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300, hard))  # Python ignores the signal
+        try:
+            write(*arguments)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+
+    monkeypatch.setattr(image, "write_planes", write_to_full_disk)
+    code = app.run(["render", "s.xml", "-o", "o.exr"])
+    out, err = capfd.readouterr()
+    assert (code, out) == (2, "")
+    assert re.fullmatch(r"fspt: image file 'o\.exr': [^\n]+\. Make room or give another place for it\.\n", err)
     assert sorted(os.listdir(tmp_path)) == ["o.exr", "s.xml"]
     assert (tmp_path / "o.exr").read_bytes() == b"the old one"
 

@@ -140,27 +140,41 @@ def test_an_existing_scene_stays(run, folder):
     assert (folder / "my.xml").read_text() == "mine"
 
 
-def completions(typed):
-    """What the shell offers for the last word of a command line."""
-    words = typed.split(" ")
-    environment = os.environ | {
-        "_FSPT_COMPLETE": "complete_bash",
-        "COMP_WORDS": typed,
-        "COMP_CWORD": str(len(words) - 1),
-    }
-    program = "import sys; from mitsuba_fspt.cli import main; sys.argv = ['fspt']; main()"
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    return done.stdout.split()
+COMPLETE = """
+import contextlib, io, json, os, sys
+from mitsuba_fspt.cli import main
+sys.argv, found = ["fspt"], []
+for typed in json.loads(sys.stdin.read()):
+    os.environ |= {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split(" ")) - 1)}
+    with contextlib.redirect_stdout(io.StringIO()) as told, contextlib.suppress(SystemExit):
+        main()
+    found.append(told.getvalue().split())
+print(json.dumps(found))
+"""
+
+
+def completions(*typed):
+    """What the shell offers for the last word of each command line; a process for all takes as long as one for one."""
+    environment = os.environ | {"_FSPT_COMPLETE": "complete_bash"}
+    call = [sys.executable, "-c", COMPLETE]
+    done = subprocess.run(call, env=environment, input=json.dumps(typed), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
 
 
 def test_the_shell_completes_verbs_options_and_words():
-    verbs = set(completions("fspt r"))
-    assert {"render", "roi"} <= verbs
+    verbs, options, methods, scenes, units = completions(
+        "fspt r",
+        "fspt render a.xml --rt",
+        "fspt render a.xml --method p",
+        "fspt scene new m",
+        "fspt render a.xml --unit p",
+    )
+    assert {"render", "roi"} <= set(verbs)
     assert "stability" not in verbs
-    assert {"--rtol"} == set(completions("fspt render a.xml --rt"))
-    assert completions("fspt render a.xml --method p") == ["path", "ptracer"]
-    assert completions("fspt scene new m") == ["mouse", "mirror_rig"]
-    assert completions("fspt render a.xml --unit p") == ["photons/s", "p/s/cm2/sr"]
+    assert {"--rtol"} == set(options)
+    assert methods == ["path", "ptracer"]
+    assert scenes == ["mouse", "mirror_rig"]
+    assert units == ["photons/s", "p/s/cm2/sr"]
 
 
 @pytest.mark.parametrize("name", ["cylinder", "rig"])
