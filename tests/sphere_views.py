@@ -62,6 +62,11 @@ def noisy(matrix, exitance, electrons, seed, read_noise=3.5, **metadata):
     return [fspt.Image(plane / per_watt, metadata=metadata) for plane in counted]
 
 
+def warn_of_nothing(monkeypatch):
+    """`invert` looks for no reason to warn of a fit, which takes two fifths of its time, where many fits are made."""
+    monkeypatch.setattr("mitsuba_fspt.inverse.invert.fit_warnings", lambda *_: ([], 0.0))
+
+
 def passes_of(true, events, rng, passes=16):
     """Mean and standard error of passes in which light arrives in `events` of random weight on the brightest pixel."""
     weight = true.max() / events
