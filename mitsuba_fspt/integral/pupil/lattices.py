@@ -58,6 +58,7 @@ def _refine(draft: Draft, above: Mask, before: int, claimed: bool) -> None:
     """Value and error of the marked pixels; `before`: lines of sight of the image before its lattices; `claimed` as of
     `_most_points`."""
     deadline, tolerance = draft.progress.deadline, draft.tolerance
+    rtol = dr.opaque(mi.Float64, draft.quadrature.rtol)
     legs = _legs(draft.view.specular)
 
     def most_points(pixels: int, points: int = 0) -> int:
@@ -91,6 +92,8 @@ def _refine(draft: Draft, above: Mask, before: int, claimed: bool) -> None:
         # Where another rule's error is smaller, lattices have to get below it.
         last = max(most_points(dr.width(means.pixels), points), points)
         expected = error * dr.opaque(mi.Float64, (points / last) ** ORDER)
+        # Lattices may be the first to meet the brightest light; its lower bound, as few points may meet too much.
+        tolerance = dr.maximum(tolerance, rtol * dr.max(means.value - error))
         left = (error > tolerance) & (expected <= dr.gather(mi.Float64, draft.error, means.pixels))
         if not dr.any(left):
             break

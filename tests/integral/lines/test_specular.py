@@ -356,7 +356,8 @@ def test_narrow_light_that_mirrors_alone_show_is_met(bounces):
     """A sphere of a quarter of a pixel behind a plate, in one mirror or in two.
 
     Expected: its image at its mirror image's place. Seen to fail, with an image of 0 and an error of 0, with the light
-    of narrow spots along straight lines alone, and with 5 % less light by mirrors.
+    of narrow spots along straight lines alone, with 5 % less light by mirrors, and with 19 million lines of sight where
+    rtol is that of the brightest pixel before any is met.
     """
     seen = np.array([0.4, 1.4 * SIDE, FOCUS])
     mirrors, where = [pane(80, PERFECT, tilt=45, size=20)], mirrored(seen, 80, 45)
@@ -370,8 +371,9 @@ def test_narrow_light_that_mirrors_alone_show_is_met(bounces):
     tiny = {"type": "sphere", "center": where.tolist(), "radius": 0.1}
     around = (16, 11, 8, 8)
     direct = fspt.render(camera_scene({**tiny, "center": seen.tolist()}, crop=around), rtol=1e-2)
-    image = fspt.render(camera_scene(tiny, bodies=(*mirrors, plate), crop=around), rtol=4e-3, max_nodes=1 << 16)
+    image = fspt.render(camera_scene(tiny, bodies=(*mirrors, plate), crop=around), rtol=4e-3)
     assert direct.power.max() > 0
+    assert image.metadata["nodes"] < 3e6
     assert (abs(image.power - direct.power) <= image.error + direct.error).all()
     assert image.error.max() < 0.5 * direct.power.max()
 
