@@ -36,7 +36,7 @@ class KeptFactor:
         of : the objects that T and Q are made of;  exact : without steps, by its own factor
         """
         far = self._distance(sigma, weight, of)
-        if self._solve is None or far > (0.0 if exact else NEAR):
+        if self._solve is None or not far <= (0.0 if exact else NEAR):  # NaN where a variance is infinite
             self._solve, far = factor(matrix), 0.0
             self._sigma, self._weight, self._of = sigma, weight, of
         return partial(_corrected, matrix, self._solve, far) if far else self._solve
@@ -45,7 +45,8 @@ class KeptFactor:
         """ε of a matrix; infinite for one of other T or Q."""
         if len(of) != len(self._of) or any(one is not other for one, other in zip(of, self._of, strict=True)):
             return np.inf
-        changed = float(np.abs((self._sigma / sigma) ** 2 - 1).max())
+        with np.errstate(invalid="ignore"):
+            changed = float(np.abs((self._sigma / sigma) ** 2 - 1).max())
         if weight == self._weight:
             return changed
         return max(changed, abs(weight / self._weight - 1)) if self._weight else np.inf

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..jit.from_numpy import from_numpy
 from ..rendering.monte_carlo import passes, tracer
 from .convergence import DIRECT_SUM, INTEGRAL, PATH, PTRACER, SURFACE_FORM
 
@@ -212,6 +211,7 @@ def raw_rate(scene: mi.Scene, lens: mi.Sensor, together: bool, least: int = 1 <<
     from ..camera.of_sensor import camera_of
     from ..integral.lines.visible_window import visible_window
     from ..integral.pupil import node_rules
+    from ..jit.from_numpy import from_numpy
     from ..jit.pixel_grid import Grid
 
     camera = camera_of(lens)

@@ -56,3 +56,7 @@ def test_many_solutions_and_other_designs_have_a_factor_of_their_own(made):
     ):
         kept.solve(normal(design, scale * sigma, 1.0), scale * sigma, 1.0, of, exact)
         assert len(made) == factors
+    endless = np.where(np.arange(20) == 3, np.inf, sigma)  # an error so large that its square is infinite
+    for scale, factors in ((1.0, 4), (2.0, 5)):
+        kept.solve(normal(design, scale * endless, 1.0), scale * endless, 1.0, (design,))
+        assert len(made) == factors
