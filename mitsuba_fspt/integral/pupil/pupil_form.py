@@ -207,13 +207,19 @@ class _Faces:
         draft.error = dr.select(where & (draft.coverage == 0), dr.maximum(draft.error, most), draft.error)
 
     def further(self) -> None:
-        """Before lattices: the values of faces again where those of transects have larger errors, refined further."""
+        """Before lattices: the values of faces again where those of transects have larger errors, refined further.
+
+        Where transects have the smaller error, but differ by more from the faces, they contradict it: the two values
+        are of independent kind, few transects may agree by chance.
+        """
         draft, grid = self.draft, self.draft.grid
         if self.found is None:
             return
         known, power, error, _ = self.found
         self._count_unmet(known & draft.computed, power)
+        differ = dr.minimum(dr.abs(power - draft.value), error)
         self._set(known & draft.computed & (error < draft.error))
+        draft.error = dr.select(known & draft.computed, dr.maximum(draft.error, differ), draft.error)
         left = grid.array(known & draft.shown & (draft.error > draft.tolerance))
         if not left.any() or draft.progress.deadline.passed():
             return

@@ -46,6 +46,9 @@ FILM_BASED = 1.0  # pixels: sides from which the étendue is that of the image, 
 GAUSS = (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # nodes on the side of a pixel
 WHOLE = 1e-6  # by which float32 changes the share of the pupil that is open
 MOST_WORK, LEAST_WORK = 1 << 22, 1 << 20  # entries of windows that are accumulated at a time; with half, 10 % slower
+# Image of a piece, over the square of its blur radius, below which the blur disc evens out what is misplaced in it.
+WIDE = 1.0
+LARGE = 1.0  # pixels²: image of a piece above which one of its random points that is hidden adds to the error
 LEFT = 1 / 3  # error over the change by twice the cells and pieces, of second order
 MOST_CHANGE = 6e4  # relative, below the largest number of float16
 
@@ -201,8 +204,8 @@ class FaceLines:
 
     def columns(self, scene: mi.Scene, camera: Camera, faces: FaceLight, on: str) -> Laid:
         """The light of J_n = 1 of each column of the face, on the crop window."""
-        image = self._image(scene, camera, faces, camera.film.crop_offset)
-        return image.laid([image.values] if on == "face" else image.of_corners())
+        image = self._image(scene, camera, faces, camera.film.crop_offset, by_points=False)
+        return image.laid([image.values] if on == "face" else image.of_corners())[0]
 
     def light(
         self,
@@ -213,17 +216,22 @@ class FaceLines:
         corner: tuple[float, float],
     ) -> tuple[Laid, Misfits | None]:
         """The light of J_n with the values `exitance` at the three corners of each face, and the coverage, on a film
-        whose first pixel has this `corner` (x, y); and what of this light the edges of shadows do not explain."""
-        image = self._image(scene, camera, faces, corner)
+        whose first pixel has this `corner` (x, y); and what random points make of both."""
+        image = self._image(scene, camera, faces, corner, by_points=True)
         levels = [mi.Float64(dr.gather(mi.Float, own, self.face)) for own in exitance]
         light = [
             sum((w[c] * level for w, level in zip(image.of_corners(), levels, strict=True)), mi.Float64(0))
             for c in range(3)
         ]
-        return image.laid([light, [image.cover] * 3]), image.spot.light(light) if image.spot else None
+        return image.laid([light, [image.cover] * 3])
 
-    def _image(self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float]) -> _Image:
-        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces."""
+    def _image(
+        self, scene: mi.Scene, camera: Camera, faces: FaceLight, corner: tuple[float, float], by_points: bool
+    ) -> _Image:
+        """The image of the lines' pieces through the nodes, or of the nodes' cells through the pieces.
+
+        by_points : light that the random points of wide pieces add or take away goes with the image
+        """
         m, elements, face = self.m, faces.elements, self.face
         part, i, j = self.number // (m * m), self.number % m, self.number // m % m
         node = pupil_cells.middle(i, j, m)
@@ -231,16 +239,7 @@ class FaceLines:
         _, lens_point, arrival, _, open_share = camera.open_arrival(middle.p, node)
         cos_s = dr.dot(middle.n, dr.normalize(lens_point - middle.p))
         active = (cos_s > 0) & (arrival > 0)
-        lit_part = None
-        if faces.shadows:
-            ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
-            mixed = active & dr.gather(mi.Bool, from_numpy(mi.Bool, faces.mixed), face)
-            lit_part = LitPart.of(scene, camera, node, ends, middle, mixed)
-            within, aim = pupil_cells.strata(i, j, m, face * pupil_cells.STRIDE + part)
-            spot, _ = elements.place(face, within, self.cut, part)
-            aim = dr.select(lit_part.some, node, aim)
-            open_spot = ~hidden(scene, spot.p, middle.n, camera.open_arrival(spot.p, aim)[1], active)
-            active &= lit_part.some | open_spot
+        shadow = self._shadow(scene, camera, faces, node, middle, active) if faces.shadows else None
         origin = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in corner))
         images, values, shares, depths, mean = [], [], [], [], mi.Float64(0)
         open_mean = 0.75 * open_share
@@ -270,18 +269,38 @@ class FaceLines:
         turn = _cross(images[1] - images[0], images[2] - images[0])
         large = (open_mean > 1 - WHOLE) & ~self.points & ~flat & (dr.abs(turn) > FILM_BASED)
         etendue = dr.select(large, 0.5 * dr.abs(turn) * mean * mi.Float64(own) / dr.pi, etendue)
-        scale, spot_light = mi.Float64(1), None
-        if lit_part:
-            at_spot = mi.Point2d(camera.open_arrival(spot.p, node)[0] - origin)
-            spot_light = _Spot.of(at_spot, light_area, active, *lit_part.beside(ends, spot.p, open_spot))
-            ring, count, scale = lit_part.of_image(camera, origin, node, ring, count)
+        scale, spot = mi.Float64(1), None
+        if shadow:
+            wide = (light_area > WIDE * dr.square(mi.Float64(radius))) & by_points
+            spot = shadow.spot(camera, origin, light_area, wide, active) if by_points else None
+            active &= shadow.laid(wide)
+            ring, count, scale = shadow.part.of_image(camera, origin, node, ring, count)
         # The falloff over the film, which is not linear over a large piece, is put back pixel by pixel.
         even = [falloff(camera, mi.Point2f(image) + origin) for image in images]
         cover = etendue / (light_area * mean)
         values = [cover / f * value for f, value in zip(even, values, strict=True)]
-        return _Image(
-            images, values, shares, depths, turn, flat, constant, cover, scale, ring, count, active, spot_light
-        )
+        return _Image(images, values, shares, depths, turn, flat, constant, cover, scale, ring, count, active, spot)
+
+    def _shadow(
+        self,
+        scene: mi.Scene,
+        camera: Camera,
+        faces: FaceLight,
+        node: mi.Point2f,
+        middle: mi.SurfaceInteraction3f,
+        active: mi.Bool,
+    ) -> _Shadow:
+        """What other surfaces hide of the lines' pieces, as seen through the nodes; `middle`: of the pieces."""
+        part, elements, face = self.number // (self.m * self.m), faces.elements, self.face
+        ends = [elements.place(face, mi.Point2f(*at), self.cut, part)[0].p for at in CORNERS]
+        mixed = active & dr.gather(mi.Bool, from_numpy(mi.Bool, faces.mixed), face)
+        lit_part = LitPart.of(scene, camera, node, ends, middle, mixed)
+        i, j = self.number % self.m, self.number // self.m % self.m
+        within, aim = pupil_cells.strata(i, j, self.m, face * pupil_cells.STRIDE + part)
+        point = elements.place(face, within, self.cut, part)[0].p
+        aim = dr.select(lit_part.some, node, aim)
+        lit = ~hidden(scene, point, middle.n, camera.open_arrival(point, aim)[1], active)
+        return _Shadow(ends, lit_part, point, aim, lit)
 
 
 @dataclass(frozen=True)
@@ -309,51 +328,91 @@ class _Image:
         """Density at the corners of the light of J_n = 1 at each corner of the face."""
         return _weights(self.values, self.shares, self.depths)
 
-    def laid(self, densities: list[list[mi.Float64]]) -> Laid:
-        """The image with these densities at its corners."""
+    def laid(self, densities: list[list[mi.Float64]]) -> tuple[Laid, Misfits | None]:
+        """The image with these densities at its corners, and the light of random points that is missing in it."""
         scaled = ([self.scale * value for value in values] for values in densities)
         planes = [_plane(self.corners, values, self.turn, self.flat, self.constant) for values in scaled]
-        return planes, self.ring, self.count, self.active
+        return (planes, self.ring, self.count, self.active), self.spot.light(densities) if self.spot else None
+
+
+@dataclass(frozen=True)
+class _Shadow:
+    """What other surfaces hide of pieces with the corners `ends`: the `part` of each that is lit, and whether a random
+    `point` of it is lit from the point `aim` of the pupil."""
+
+    ends: list[mi.Point3f]
+    part: LitPart
+    point: mi.Point3f
+    aim: mi.Point2f
+    lit: mi.Bool
+
+    def laid(self, wide: mi.Bool) -> mi.Bool:
+        """True where the image of a piece is laid, at least in part.
+
+        Where no edge crosses it, `wide` images are laid as their corners are lit, so that only the light of the random
+        point is added or taken away. Others are evened out by the blur, and laid as their point is lit.
+        """
+        return self.part.some | dr.select(wide, self.part.open, self.lit)
+
+    def spot(self, camera: Camera, origin: mi.Vector2f, area: mi.Float64, wide: mi.Bool, active: mi.Bool) -> _Spot:
+        """The random points at which that is wrong, for images of this `area` [pixels²]."""
+        shares, within = self.part.contains(self.ends, self.point)
+        within = dr.select(self.part.some, within, self.laid(wide))
+        place = mi.Point2d(camera.open_arrival(self.point, self.aim)[0] - origin)
+        wrong = active & (self.lit != within)
+        return _Spot(shares, dr.select(self.lit, area, -area), place, wrong, self.part.some)
 
 
 @dataclass(frozen=True)
 class _Spot:
-    """Random points of pieces at which `LitPart` is wrong: barycentric coordinates, area of the piece's image
-    [pixels²], negative where it is too bright, place on the film, and where there is any."""
+    """Random points of pieces at which their images are wrong: barycentric coordinates, `area` of the image [pixels²],
+    negative where it is too bright, place on the film, where there is any, and whether an edge of a shadow crosses."""
 
     shares: list[mi.Float]
     area: mi.Float64
     place: mi.Point2d
     active: mi.Bool
+    at_edge: mi.Bool
 
-    @classmethod
-    def of(cls, place: mi.Point2d, area: mi.Float64, active: mi.Bool, shares: list[mi.Float], sign: mi.Float) -> _Spot:
-        """Those of all points whose `sign` is not 0, for images of pieces of this `area`."""
-        return cls(shares, mi.Float64(sign) * area, place, active & (sign != 0))
-
-    def light(self, density: list[mi.Float64]) -> Misfits:
-        """Their light, for the density of light at the corners of the pieces."""
-        level = sum((mi.Float64(s) * d for s, d in zip(self.shares, density, strict=True)), mi.Float64(0))
-        return Misfits(self.place, self.area * level, self.active)
+    def light(self, densities: list[list[mi.Float64]]) -> Misfits:
+        """Their light, for densities of light at the corners of the pieces."""
+        levels = [
+            sum((mi.Float64(s) * d for s, d in zip(self.shares, density, strict=True)), mi.Float64(0))
+            for density in densities
+        ]
+        return Misfits(self.place, [self.area * level for level in levels], self.active, self.at_edge, self.area)
 
 
 @dataclass(frozen=True)
 class Misfits:
-    """Light of random points, some of them `active`, that the edges of shadows leave out, over that of a pixel filled
-    by 1 W/mm²/sr, negative where they let too much pass; and their places on the film [pixels]."""
+    """Light of random points, some of them `active`, that images of pieces leave out, over that of a pixel filled by
+    1 W/mm²/sr, negative where they let too much pass, for each column; their places on the film [pixels]; True where
+    the edge of a shadow crosses the piece; and the area of its image [pixels²], negative as the light.
+
+    Beside such edges few points are wrong, but by a whole piece each, where the edge is nearly exact; the others are
+    the only sign of what hides a part of a piece.
+    """
 
     place: mi.Point2d
-    light: mi.Float64
+    light: list[mi.Float64]
     active: mi.Bool
+    at_edge: mi.Bool
+    area: mi.Float64
 
-    def on_film(self, shape: tuple[int, int]) -> tuple[Index, Index, Array]:
-        """Row, column and light (n,) of those on a film of this `shape` (h, w)."""
+    def put(self, canvas: ColumnCanvas, columns: Sequence[mi.UInt32]) -> None:
+        """Add the light of those that no edge crosses to the columns of a canvas."""
+        canvas.put(columns, self.light, self.place, self.active & ~self.at_edge)
+
+    def on_film(self, shape: tuple[int, int]) -> tuple[Index, Index, Array, Mask, Mask]:
+        """Row, column and light of the first column on a film of `shape` (h, w), True at edges, and True for a piece
+        whose image is larger than `LARGE`, (n,) each."""
         some = dr.compress(self.active)
-        columns = (self.place.y, self.place.x, self.light)
-        y, x, light = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
+        columns = (self.place.y, self.place.x, self.light[0], self.area)
+        y, x, light, area = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
         row, column = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
         on = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
-        return row[on], column[on], light[on]
+        at_edge = dr.gather(mi.Bool, self.at_edge, some).numpy()
+        return row[on], column[on], light[on], at_edge[on], np.abs(area[on]) > LARGE
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:

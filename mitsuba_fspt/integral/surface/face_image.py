@@ -35,7 +35,7 @@ from ..quadrature import TOGETHER_BY_SURFACE, Quadrature
 from ..shortcuts import Finding, on_surfaces
 from ..solution import Solution
 from .column_canvas import ColumnCanvas, Windows
-from .column_form import FaceLines, falloff_on_pixels
+from .column_form import FaceLines, Misfits, falloff_on_pixels
 from .face_light import ColumnRule, FaceLight, Plan
 from .glow import touching
 
@@ -180,9 +180,9 @@ class FaceImage:
                 break
             if (found := self._level(plans, around, progress.deadline)) is None:
                 break
-            self.plans, self.level, (value, coverage, torn) = plans, level, found
+            self.plans, self.level, (value, coverage, edges) = plans, level, found
             change = np.where(around, np.abs(value - self.value), 0)
-            recent = np.maximum(safety * _largest(change), _largest(torn))
+            recent = np.maximum(safety * _largest(change), _largest(edges))
             least = max(EXPECTED * FALL ** (level - 2), PERSPECTIVE) * self.quadrature.rtol * self._peak(least_peak)
             self.error[mark] = np.maximum(recent, least)[mark]
             self.value[around], self.coverage[around] = value[around], coverage[around]
@@ -273,14 +273,14 @@ class FaceImage:
     def _level(
         self, plans: list[Plan], mark: NDArray[np.bool_], deadline: Deadline | None
     ) -> tuple[Plane, Plane, Plane] | None:
-        """Value, coverage and error by shadows without one edge on marked pixels, incomplete on others; None where the
+        """Value, coverage and error beside edges of shadows on marked pixels, incomplete on others; None where the
         deadline passes before the end."""
         height, width = self.window.shape
         whole = np.zeros(2, np.int64)
         windows = Windows(whole, whole, whole + width, whole + height)
         canvas = ColumnCanvas(self.window.shape, windows)
         columns = [dr.opaque(mi.UInt32, k) for k in range(2)]
-        laid, misfit, square = 0, np.zeros((height, width)), np.zeros((height, width))
+        laid, beside = 0, _Beside(self.window.shape)
         for faces, plan, corners, index in zip(self.faces, plans, self.exitance, self._touching(mark), strict=True):
             own = plan.of(index)
             items = np.stack([index, own.cells[:, 0], own.cuts[:, 0], own.points[:, 0]])
@@ -294,25 +294,48 @@ class FaceImage:
                     self.scene, self.camera, faces, corners, self.window.corner
                 )
                 canvas.lay(columns, planes, ring, count, active)
+                if off:
+                    off.put(canvas, columns)
                 canvas.evaluate(*vars(off).values() if off else ())
                 if off:
-                    row, column, light = off.on_film((height, width))
-                    np.add.at(misfit, (row, column), light)
-                    np.add.at(square, (row, column), light**2)
+                    beside.add(off)
         self.rays += laid
         self.levels.append(f"images of faces: {np.count_nonzero(mark)} pixels, {laid} images")
         value, coverage = canvas.light().reshape(2, height, width + 1)[..., :width]
-        return value * self.falloff * self.most, coverage, _torn(misfit, square) * self.falloff * self.most
+        missing, error = beside.edges()
+        unit = self.falloff * self.most
+        return np.maximum(value + missing, 0) * unit, np.maximum(coverage, 0), error * unit
 
 
-def _torn(sums: Plane, squares: Plane) -> Plane:
-    """Error (h, w) from sums of random terms that shadows without one edge leave out, and from their squares.
+class _Beside:
+    """Sums on pixels (h, w) of random points that images of pieces leave out: of their light at edges of shadows and of
+    its squares, and of the squares on large pieces that no such edge crosses."""
 
-    A third of the sum over 3 × 3 pixels, as a strip of shadow passes three of them, where it is above `SURE` standard
-    deviations, else 0.
-    """
-    around, variance = (uniform_filter(image, 3, mode="constant") * 9 for image in (sums, squares))
-    return np.where(around**2 > SURE**2 * variance, np.abs(around) / 3, 0.0)
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.at_edges, self.squares, self.large = (np.zeros(shape) for _ in range(3))
+
+    def add(self, off: Misfits) -> None:
+        """Add the light of more points."""
+        row, column, light, at_edge, large = off.on_film(self.large.shape)
+        for plane, amount in (
+            (self.at_edges, light * at_edge),
+            (self.squares, light**2 * at_edge),
+            (self.large, light**2 * (large & ~at_edge)),
+        ):
+            np.add.at(plane, (row, column), amount)
+
+    def edges(self) -> tuple[Plane, Plane]:
+        """Light (h, w) that the edges of shadows leave out, and its error, with that on large pieces.
+
+        The light is 0 unless the sum over 3 × 3 pixels is above `SURE` standard deviations: single terms are far less
+        exact than one edge. The error is three deviations on the pixel, or one around, as no point may lie on the pixel
+        itself. On a piece larger than a pixel every point that is hidden counts, as there should be none.
+        """
+        around, variance = (uniform_filter(plane, 3, mode="constant") * 9 for plane in (self.at_edges, self.squares))
+        variance = np.maximum(variance, 0)  # of differences of rounded sums
+        several = around**2 > SURE**2 * variance
+        error = np.where(several, np.maximum(3 * np.sqrt(self.squares), np.sqrt(variance)), 0)
+        return np.where(several, self.at_edges, 0), np.maximum(error, 3 * np.sqrt(self.large))
 
 
 def _steepest(image: Plane) -> Plane:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...emission.elements import Elements, elements_of
 from ...emission.emitting_surface import EmittingSurface
-from ...jit.batches import BATCH
+from ...jit.batches import BATCH, batch_slices, numbered
 from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import triangles
 from ..estimator import Thresholds, bound
@@ -44,6 +44,7 @@ PERSPECTIVE_LEFT, EVENED = 0.16, 4.0
 # through nodes are bent and their density is not even: so much of its light, times δ², is misplaced.
 BENT_LEFT, MOST_SHIFT = 1.6, 8.0
 OPEN_POINTS = ((0, 0), (0.7, 0), (-0.7, 0), (0, 0.7), (0, -0.7))  # of the unit disc, whose images are compared
+PROBES = 4, 256  # least and largest square root of the number of lines of sight that search for occluders of a face
 FEWEST, MOST = 4, 64  # least and largest M of columns
 DROP = 0.01  # of rtol and of a column's brightest entry: entries below are left out
 LONGEST = 1e6  # pixels: side counted for a face that reaches through the lens plane and has no image
@@ -236,7 +237,7 @@ class FaceLight:
         if not bright.size:
             return self
         share = np.zeros(len(self.corners))
-        share[bright] = _open_share(scene, camera, self.elements, bright)
+        share[bright] = _open_share(scene, camera, self.elements, bright, self._probes[bright])
         count = int(self.corners.max(initial=-1)) + 1
         least, most = np.ones(count), np.zeros(count)
         for k in range(3):
@@ -250,6 +251,13 @@ class FaceLight:
         cut = self.cut.copy()
         cut[self.corners[mixed | hidden_all].ravel()] = True
         return replace(self, low=low, high=high, cut=cut, mixed=mixed, shadows=True)
+
+    @property
+    def _probes(self) -> Index:
+        """Square root of the number of lines of sight of each face that show whether anything hides a part of it: one
+        for each pixel of its image, but `PROBES` at least and at the most."""
+        sides, heights = (np.minimum(of, LONGEST) for of in (self.sides, self.heights))
+        return np.ceil(np.sqrt(sides * heights / 2)).clip(*PROBES).astype(np.int64)
 
     def plan(self, rule: ColumnRule, on: str) -> Plan:
         """How the faces are divided: the cheaper of nodes with images of pieces and pieces with images of cells."""
@@ -387,15 +395,18 @@ def _opening(elements: Elements, camera: Camera) -> tuple[Array, Mask]:
     return shift.numpy().astype(np.float64), behind | np.broadcast_to(closed.numpy(), elements.count)
 
 
-def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, cells: int = 4) -> Array:
-    """Share of the lines of sight of each of some faces that nothing blocks, of `cells`² lines."""
-    index = from_numpy(mi.UInt32, np.repeat(faces, cells**2))
-    number = from_numpy(mi.UInt32, np.tile(np.arange(cells**2), len(faces)))
-    m = mi.UInt32(cells)
-    within, aim = pupil_cells.strata(number % m, number // m, m, index * pupil_cells.STRIDE)
-    spot, _ = elements.place(index, within)
-    _, lens_point, arrival, _, share = camera.open_arrival(spot.p, aim)
-    reaches = (share * arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
-    blocked = reaches & hidden(scene, spot.p, spot.n, lens_point, reaches)
-    counted = [np.asarray(flag.numpy()).reshape(-1, cells**2).sum(axis=1) for flag in (reaches, blocked)]
-    return 1 - counted[1] / np.maximum(counted[0], 1)
+def _open_share(scene: mi.Scene, camera: Camera, elements: Elements, faces: Index, probes: Index) -> Array:
+    """Share of the lines of sight of each of some `faces` (n,) that nothing blocks, of `probes`² (n,) lines."""
+    reaching, stopped = np.zeros((2, len(faces)))
+    for some in batch_slices(probes**2):
+        row, number = numbered(probes[some] ** 2)
+        index, m, k = (from_numpy(mi.UInt32, of) for of in (faces[some][row], probes[some][row], number))
+        m = dr.maximum(m, 1)  # beyond the last line it is 0, and whole numbers divided by 0 end the process
+        within, aim = pupil_cells.strata(k % m, k // m, m, index * pupil_cells.STRIDE)
+        spot, _ = elements.place(index, within)
+        _, lens_point, arrival, _, share = camera.open_arrival(spot.p, aim)
+        reaches = (share * arrival > 0) & (dr.dot(spot.n, lens_point - spot.p) > 0)
+        blocked = reaches & hidden(scene, spot.p, spot.n, lens_point, reaches)
+        for sums, flag in ((reaching[some], reaches), (stopped[some], blocked)):
+            sums += np.bincount(row, flag.numpy(), len(sums))
+    return 1 - stopped / np.maximum(reaching, 1)

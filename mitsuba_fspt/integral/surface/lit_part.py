@@ -2,7 +2,7 @@
 
 Rays from the corners of a triangle through one node of the pupil show whether all of it is lit. If they differ, an edge
 cuts off the corner that differs from the others; bisection finds it. A further ray from a random point shows where a
-triangle is hidden in another way.
+triangle is hidden in another way, as by a hole or a strip of shadow.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ PARABOLA = 4 / 3  # area between a parabola and its chord, over that of the tria
 class LitPart:
     """The part of triangles that is lit, where the edge of a shadow cuts off one of their corners.
 
-    some : True where it does. first, second, third : the corners, that one first. lit : True where it is the lit one.
+    some : True where it does. open : True where it does not and the corners are lit. first, second, third : the
+        corners, the one that is cut off first. lit : True where that is the lit one.
     along : shares of the sides from it to the two others where the edge crosses them
     beyond : share of the way from the corner to the chord between these by which the edge lies beyond its middle
     """
 
     some: mi.Bool
+    open: mi.Bool
     first: mi.Point3f
     second: mi.Point3f
     third: mi.Point3f
@@ -48,7 +50,10 @@ class LitPart:
         middle: mi.SurfaceInteraction3f,
         active: mi.Bool,
     ) -> LitPart:
-        """Of triangles with the corners `ends` as seen through a node of the pupil; found by bisection."""
+        """Of triangles with the corners `ends` as seen through a node of the pupil; found by bisection.
+
+        `middle`: of each triangle. Triangles that are not `active` count as open.
+        """
 
         def open_from(point: mi.Point3f, asked: mi.Bool) -> mi.Bool:
             start = point + INWARD * (middle.p - point)
@@ -83,20 +88,15 @@ class LitPart:
         sides = dr.opaque(mi.UInt32, 2 * HALVINGS)
         place, _ = repeat(dr.select(some, sides + HALVINGS, 0), halve, mi.Point3f(0.5), mi.Float(0.25))
         along, beyond = _shadow_edge(place)
-        return cls(some, first, second, third, lit, along, beyond)
+        return cls(some, ~some & (seen[0] | ~active), first, second, third, lit, along, beyond)
 
-    def beside(self, ends: list[mi.Point3f], point: mi.Point3f, lit: mi.Bool) -> tuple[list[mi.Float], mi.Float]:
-        """Barycentric coordinates of random points of triangles, and 1 where one is lit beyond this part, -1 where it
-        is dark within, else 0.
-
-        The mean of the latter is the share of a triangle that the edge leaves out: with a strip of shadow, or a hole.
-        """
+    def contains(self, ends: list[mi.Point3f], point: mi.Point3f) -> tuple[list[mi.Float], mi.Bool]:
+        """Barycentric coordinates of points of triangles, and whether they are lit where an edge crosses one."""
         x, y = _coordinates(ends, point)
         u, v = _coordinates([self.first, self.second, self.third], point)
         u, v = u / dr.maximum(self.along.x, 1e-6), v / dr.maximum(self.along.y, 1e-6)
         corner = u + v < 1 + self.beyond * dr.maximum(1 - dr.square(u - v), 0)
-        within = corner == self.lit
-        return [1 - x - y, x, y], dr.select(self.some & (within != lit), dr.select(lit, 1.0, -1.0), 0.0)
+        return [1 - x - y, x, y], corner == self.lit
 
     def of_image(
         self,
