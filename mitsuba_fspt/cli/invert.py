@@ -81,7 +81,7 @@ def invert(
 
 
 def _text(found: Inversion, output: Path) -> str:
-    """The result in two lines."""
+    """The result in two lines, in a third what of it is not known."""
     numbers = found.summary()
     total = f"{found.total:.5g} W"
     if "total_interval" in numbers:
@@ -91,5 +91,17 @@ def _text(found: Inversion, output: Path) -> str:
     return (
         f"{output}: {total} from the {100 * numbers['seen']:.3g} % of the surface that is seen{left_out}, peak "
         f"{numbers['peak']:.4g} W/mm^2\n"
-        f"chi2 {found.chi2:.3g} over {found.pixels} pixels, weight {found.weight:.3g} mm^2"
+        f"chi2 {found.chi2:.3g} over {found.pixels} pixels, weight {found.weight:.3g} mm^2{_unknown(found, output)}"
+    )
+
+
+def _unknown(found: Inversion, output: Path) -> str:
+    """A line on vertices or faces that the images do not determine, at which a PLY file has J_n = 0; else empty."""
+    unknown = int((~found.seen).sum())
+    if not unknown or output.suffix.lower() != ".ply":
+        return ""
+    elements = "vertices" if found.matrix.on == "vertex" else "faces"
+    return (
+        f"\n{unknown} of {found.seen.size} {elements} are not determined by these images: J_n is 0 there in {output}, "
+        "with seen_x = 0, and its renderings show them dark"
     )

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import os
 import signal
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sphere_views import sphere_views, write_sphere
 
 import mitsuba_fspt as fspt
+from mitsuba_fspt.cli.invert import _unknown
 from mitsuba_fspt.inverse.invert import Problem
 
 CAMERA = """[detector]
@@ -160,3 +163,12 @@ def test_bad_input_of_reduce(run, folder, monkeypatch, tmp_path):
         assert (code, out, err.count("\n")) == (2, "", 1)
         assert words in err
     assert files(folder) == before
+
+
+def test_what_the_images_do_not_determine_is_told():
+    """A PLY has J_n = 0 there, so that a rendering of it is dark where the phantom is not; a VTU has NaN."""
+    found = SimpleNamespace(seen=np.array([True, False, False]), matrix=SimpleNamespace(on="vertex"))
+    assert "2 of 3 vertices are not determined" in _unknown(found, Path("phantom.ply"))
+    assert not _unknown(found, Path("phantom.vtu"))
+    found.seen[:] = True
+    assert not _unknown(found, Path("phantom.ply"))
