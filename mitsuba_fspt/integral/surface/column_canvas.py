@@ -166,23 +166,6 @@ class ColumnCanvas:
 
         along_edges(ring, active, self._size, add, count)
 
-    def put(
-        self, columns: Sequence[mi.UInt32], light: Sequence[mi.Float64], place: mi.Point2d, active: mi.Bool
-    ) -> None:
-        """Add `light`, an array for each of several columns, to the pixel at a `place` [pixels]; negative light, too.
-
-        Light beside a column's window is dropped.
-        """
-        mode = self._sums.mode(dr.width(place))
-        x, y = (mi.Int32(dr.floor(dr.clip(place[n], -1, self._size[n]))) for n in (0, 1))
-        for column, amount in zip(columns, light, strict=True):
-            window = self._place(column, active)
-            left, top = x - window.left, y - window.top
-            on = (left >= 0) & (left < window.width) & (top >= 0) & (top < window.height)
-            entry = window.start + mi.UInt32(top) * mi.UInt32(window.width + 1) + mi.UInt32(left)
-            quanta = mi.Int64(dr.round(amount / QUANTUM))
-            self._sums.add(entry, (quanta, -quanta, mi.Int64(0)), active & on, mode)
-
     def _place(self, column: mi.UInt32, active: mi.Bool) -> _Place:
         """Where a column lies, from the table."""
         fields, first = mi.Int32(self._table), PLACE * column

@@ -399,20 +399,16 @@ class Misfits:
     at_edge: mi.Bool
     area: mi.Float64
 
-    def put(self, canvas: ColumnCanvas, columns: Sequence[mi.UInt32]) -> None:
-        """Add the light of those that no edge crosses to the columns of a canvas."""
-        canvas.put(columns, self.light, self.place, self.active & ~self.at_edge)
-
     def on_film(self, shape: tuple[int, int]) -> tuple[Index, Index, Array, Mask, Mask]:
-        """Row, column and light of the first column on a film of `shape` (h, w), True at edges, and True for a piece
+        """Row and column on a film of `shape` (h, w), light of each column (c, n), True at edges, and True for a piece
         whose image is larger than `LARGE`, (n,) each."""
         some = dr.compress(self.active)
-        columns = (self.place.y, self.place.x, self.light[0], self.area)
-        y, x, light, area = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
+        columns = (self.place.y, self.place.x, self.area, *self.light)
+        y, x, area, *light = (dr.gather(mi.Float64, column, some).numpy() for column in columns)
         row, column = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
         on = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
         at_edge = dr.gather(mi.Bool, self.at_edge, some).numpy()
-        return row[on], column[on], light[on], at_edge[on], np.abs(area[on]) > LARGE
+        return row[on], column[on], np.stack(light)[:, on], at_edge[on], np.abs(area[on]) > LARGE
 
 
 def falloff(camera: Camera, position: mi.Point2f) -> mi.Float64:

@@ -294,14 +294,12 @@ class FaceImage:
                     self.scene, self.camera, faces, corners, self.window.corner
                 )
                 canvas.lay(columns, planes, ring, count, active)
-                if off:
-                    off.put(canvas, columns)
                 canvas.evaluate(*vars(off).values() if off else ())
                 if off:
                     beside.add(off)
         self.rays += laid
         self.levels.append(f"images of faces: {np.count_nonzero(mark)} pixels, {laid} images")
-        value, coverage = canvas.light().reshape(2, height, width + 1)[..., :width]
+        value, coverage = canvas.light().reshape(2, height, width + 1)[..., :width] + beside.points
         missing, error = beside.edges()
         unit = self.falloff * self.most
         return np.maximum(value + missing, 0) * unit, np.maximum(coverage, 0), error * unit
@@ -309,15 +307,18 @@ class FaceImage:
 
 class _Beside:
     """Sums on pixels (h, w) of random points that images of pieces leave out: of their light at edges of shadows and of
-    its squares, and of the squares on large pieces that no such edge crosses."""
+    its squares; of light and coverage of the other points, (2, h, w), and of the squares of those on large pieces."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
+        self.points = np.zeros((2, *shape))
         self.at_edges, self.squares, self.large = (np.zeros(shape) for _ in range(3))
 
     def add(self, off: Misfits) -> None:
         """Add the light of more points."""
-        row, column, light, at_edge, large = off.on_film(self.large.shape)
+        row, column, (light, coverage), at_edge, large = off.on_film(self.large.shape)
         for plane, amount in (
+            (self.points[0], light * ~at_edge),
+            (self.points[1], coverage * ~at_edge),
             (self.at_edges, light * at_edge),
             (self.squares, light**2 * at_edge),
             (self.large, light**2 * (large & ~at_edge)),
