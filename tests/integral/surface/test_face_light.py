@@ -89,3 +89,18 @@ def test_faces_behind_the_lens_and_in_its_borders_shadow_are_dark(tmp_path):
     assert bright(to_world=aside).all()
     assert not bright(to_world=aside, **border).any()
     assert not bright(to_world=away).any()
+
+
+def test_a_small_occluder_of_a_large_face_is_found(tmp_path):
+    """A plate of two faces of 98 pixels each, and a ball of two square pixels before one of them.
+
+    Expected: both count as hidden in part, as they share corners. Seen to fail where 16 lines search for occluders of
+    a face, whatever its size.
+    """
+    corners = np.array([[-20, -14, -14], [-20, 14, -14], [-20, 14, 14], [-20, -14, 14]])
+    plate = write_ply(tmp_path / "plate.ply", corners, np.array([[0, 1, 2], [0, 2, 3]]), vertex=np.ones(4))
+    body = {"type": "ply", "filename": str(plate), "face_normals": True, "emitter": glow(attribute())}
+    small = {"type": "sphere", "center": [-17, 2.5, 6.3], "radius": 1.6}
+    scene = world_scene(body, small, sensor=lens(32, 1.0, f_number=2.8))
+    camera, surface = scene.sensors()[0].camera, scene.emitters()[0].surface
+    assert FaceLight.seen(surface, camera, (0, 0), (32, 32)).behind(scene, camera).mixed.all()
