@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from ..camera.camera import Camera
 from ..camera.window import Boxes, Window, window_of
@@ -29,8 +30,9 @@ from .lines.traced_scene import TracedScene, geometry_of, pose_of
 from .lines.visible_window import glowing_boxes
 from .progress import Progress
 from .pupil import interpolated, pupil_form
+from .pupil.dark_bodies import DarkBodies
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NarrowLight, edge_on_light, peak_of_points
+from .pupil.narrow import NARROW, UNCERTAINTY, NarrowLight, edge_on_light, peak_of_points
 from .pupil.seen_points import SeenPoints
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
@@ -42,7 +44,6 @@ from .tiles import Mosaic
 from .work_log import WorkLog
 
 LEAST_DISPLACEMENT = 1e-3  # pixels: least displacement of lines of sight by float32 that is added to the error
-NARROW = 0.1  # times rtol times the brightest pixel: pixels with more light of narrow spots take the surface form
 PLAIN = 0.7  # of rtol: tolerance of the light by plain courses (`Specular.part`); the rest is that of all others
 OTHERS = 4  # largest number of lines of sight of a pixel over that for all other courses
 MOST_KEPT = 1 << 20  # faces as a camera sees them, of 130 bytes each, that are kept between renders
@@ -54,7 +55,7 @@ class Solver:
     def __init__(self) -> None:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
-        self._window, self._narrow, self._edge_on = (CachedValue() for _ in range(3))
+        self._window, self._narrow, self._edge_on, self._dark = (CachedValue() for _ in range(4))
         self._faces, self._seen_faces, self._grid_of_blocks = (CachedValue() for _ in range(3))
 
     def solve(
@@ -153,6 +154,11 @@ class Solver:
         state = _seen_state(view, window)
         return self._narrow.recall(state, lambda: SeenPoints.of(view).narrow_light(window), held)
 
+    def _dark_bodies(self, view: View, window: Window) -> DarkBodies:
+        """What bodies without light hide and let through on the pixels of a window; cached."""
+        held = [geometry_of(shape) for shape in view.scene.shapes()]
+        return self._dark.recall(_seen_state(view, window), lambda: DarkBodies.seen(view, window), held)
+
     def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
         """`NarrowLight.edge_on` on the pixels of a window; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
@@ -177,7 +183,9 @@ class Solver:
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points.straight, window))
         for k, tile in enumerate(tiles):
             light = partial(points.narrow_light, tile) if points else partial(self._narrow_light, view, tile)
-            mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, least_peak, progress.part(k, len(tiles))))
+            dark = partial(self._dark_bodies, view, tile) if narrow else partial(DarkBodies.none, tile.shape)
+            part = progress.part(k, len(tiles))
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, dark, least_peak, part))
 
     def _solve_tile(
         self,
@@ -185,6 +193,7 @@ class Solver:
         view: View,
         quadrature: Quadrature,
         narrow_light: Callable[[], tuple[NarrowLight, NarrowLight, NDArray[np.float64]]],
+        dark_bodies: Callable[[], DarkBodies],
         least_peak: float,
         progress: Progress,
     ) -> Solution:
@@ -198,16 +207,18 @@ class Solver:
         inside, cut = window.field_stop(camera)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            return self._by_surface(window, view, quadrature, least_peak, progress)
+            return self._by_surface(window, view, quadrature, dark_bodies().shade, least_peak, progress)
         blocks, why = self._blocks(view, window, quadrature)
         if blocks:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
                 return solution
             why = "most blocks of pixels have an edge, or light too narrow for them"
         narrow, elsewhere, anywhere = narrow_light()
+        dark = dark_bodies()
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
+            where &= dark.shade <= NARROW * quadrature.rtol  # shade takes lines of sight
             peak = max(narrow.brightest / 2, least_peak)
         if specular and specular.bending:  # the surface form contains only light that goes straight to the lens
             where = np.zeros(window.shape, bool)
@@ -216,7 +227,7 @@ class Solver:
         by_faces = self._face_image(window, view, quadrature, peak)
         on_faces = where & window.fully_open(camera) if by_faces else np.zeros(window.shape, bool)
         by_elements = where & ~on_faces
-        form = partial(pupil_form.solve, view, window, quadrature)
+        form = partial(pupil_form.solve, view, window, quadrature, dark=dark)
         if by_elements.any():
             part, rest = progress.part(0, 2), progress.part(1, 2)
             known = surface_form.solve(scene, camera, window, quadrature, by_elements, peak, part, specular)
@@ -225,17 +236,25 @@ class Solver:
         elif by_faces:
             solution = form(narrow, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
-            solution = _by_courses(view, window, quadrature, narrow, elsewhere, least_peak, progress)
+            solution = _by_courses(view, window, quadrature, narrow, elsewhere, dark, least_peak, progress)
         else:
             solution = form(narrow.plus(elsewhere), None, least_peak, progress)
         error = np.maximum(solution.error, window.expand(anywhere) * camera.etendue)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
-        return replace(solution, error=error, findings=findings)
+        solution = replace(solution, error=error, findings=findings)
+        return _with_shade(solution, window, dark.shade) if everywhere else solution
 
     def _by_surface(
-        self, window: Window, view: View, quadrature: Quadrature, least_peak: float, progress: Progress
+        self,
+        window: Window,
+        view: View,
+        quadrature: Quadrature,
+        shade: NDArray[np.float64],
+        least_peak: float,
+        progress: Progress,
     ) -> Solution:
-        """Solution by the surface form alone: from the faces of meshes, from elements of other surfaces."""
+        """Solution by the surface form alone: from the faces of meshes, from elements of other surfaces; `shade` as of
+        `DarkBodies`."""
         scene, camera = view.scene, view.camera
         dark_too = not quadrature.takes("dark")
         by_faces = self._face_image(window, view, quadrature, least_peak, dark_too)
@@ -243,9 +262,10 @@ class Solver:
             known = by_faces.run(np.ones(window.shape, bool), least_peak, progress, surface_form.MOST_LINES)
             if progress.log:
                 progress.log.add("images of faces", window.count, known.rays)
+            shade = np.where(by_faces.shaded, 0, shade)  # faces that shadows cross have them
         else:
             known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, view.specular)
-        return _with_dark_coverage(known, view, window)
+        return _with_shade(_with_dark_coverage(known, view, window), window, shade)
 
     def _face_image(
         self, window: Window, view: View, quadrature: Quadrature, least_peak: float, dark_too: bool = True
@@ -306,6 +326,7 @@ def _by_courses(
     quadrature: Quadrature,
     narrow: NarrowLight,
     elsewhere: NarrowLight,
+    dark: DarkBodies,
     least_peak: float,
     progress: Progress,
 ) -> Solution:
@@ -324,7 +345,7 @@ def _by_courses(
         shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
     shares[1] = replace(shares[1], max_nodes=few)
     first, rest = progress.part(0, 2), progress.part(1, 2)
-    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(elsewhere), None, least_peak, first)
+    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(elsewhere), None, least_peak, first, dark=dark)
     peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
     others = replace(elsewhere, in_focus=narrow.in_focus)
     return image.plus(pupil_form.solve(views[1], window, shares[1], others, None, peak, rest))
@@ -336,6 +357,12 @@ def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solut
         return solution
     met = np.where(solution.where, pupil_form.coverage_of(view, window), 0)
     return replace(solution, coverage=np.maximum(solution.coverage, met))
+
+
+def _with_shade(solution: Solution, window: Window, shade: NDArray[np.float64]) -> Solution:
+    """The surface form's `solution`, with the `shade` (h, w) of narrow bodies, which that form may miss, as error."""
+    hidden = window.expand(np.minimum(UNCERTAINTY * shade, 1)) * maximum_filter(solution.power, 3)
+    return replace(solution, error=np.maximum(solution.error, hidden))
 
 
 def _outside(window: Window) -> Finding:

@@ -29,6 +29,7 @@ Indices = NDArray[np.int64]
 DARK = {"type": "diffuse"}
 APART = 1.02  # least distance of the centres of two bodies, over the sum of their radii, so that they do not intersect
 FRESNEL_INDEX = 1.37
+BEFORE = -60.0, -20.0  # depths of narrow dark bodies before the virtual detector plane [mm]
 TRIES = 60  # random positions tried for a body
 
 
@@ -180,6 +181,51 @@ class _Maker:
         if centre is not None:
             shape = Simple(Disc(centre, turn[:, 2], radius))
             self.glowing(shape, {"type": "disk", "to_world": _matrix(turn * radius, centre)}, dark)
+
+    def backdrop(self) -> None:
+        """A glowing plate that fills the field, behind the bodies in the middle."""
+        half = 0.8 * self.field_width
+        centre = np.array([0.0, 0.0, self.focus + float(self.random.uniform(40, 60))])
+        turn = np.diag([-1.0, 1.0, -1.0])
+        shape = Simple(Rectangle(centre, turn[:, 0] * half, turn[:, 1] * half))
+        self.glowing(shape, {"type": "rectangle", "to_world": _matrix(turn * [half, half, 1], centre)})
+
+    def _far_below_a_pixel(self, most: float) -> float:
+        """Random length between a fiftieth and `most` of a pixel at the virtual detector plane [mm]."""
+        pixel = self.field_width / max(self.size)
+        return float(pixel * np.exp(self.random.uniform(np.log(0.02), np.log(most))))
+
+    def grain(self) -> None:
+        """A dark ball narrower than a pixel."""
+        radius = self._far_below_a_pixel(0.4)
+        centre = self.place(radius, BEFORE)
+        if centre is not None:
+            ball = {"type": "sphere", "center": centre.tolist(), "radius": radius}
+            self.glowing(Simple(Sphere(centre, radius)), ball, dark=True)
+
+    def wire(self) -> None:
+        """A dark cylinder thinner than a pixel, open at its ends."""
+        radius, height = self._far_below_a_pixel(0.2), float(self.random.uniform(4, 25))
+        centre = self.place(height / 2, BEFORE)
+        turn = self.turn(centre)
+        if centre is None:
+            return
+        ends = [centre - height / 2 * turn[:, 0], centre + height / 2 * turn[:, 0]]
+        tube = {"type": "cylinder", "p0": ends[0].tolist(), "p1": ends[1].tolist(), "radius": radius}
+        self.glowing(Simple(Cylinder(centre, turn[:, 0], radius, height)), tube, dark=True)
+
+    def slit(self) -> None:
+        """Two dark plates side by side in one plane, with less than a pixel between them."""
+        half, gap = self.random.uniform(4, 12, 2), self._far_below_a_pixel(0.6)
+        middle = self.place(float(np.hypot(*half)), BEFORE)
+        turn = self.turn(middle)
+        if middle is None:
+            return
+        for side in (-1, 1):
+            centre = middle + side * (half[0] + gap) / 2 * turn[:, 0]
+            shape = Simple(Rectangle(centre, turn[:, 0] * half[0] / 2, turn[:, 1] * half[1]))
+            plate = {"type": "rectangle", "to_world": _matrix(turn * [half[0] / 2, half[1], 1], centre)}
+            self.glowing(shape, plate, dark=True)
 
     def cylinder(self) -> None:
         radius, height = self.random.uniform(1, 8), self.random.uniform(2, 25)
@@ -339,6 +385,13 @@ def _occluders(maker: _Maker) -> None:
         getattr(maker, str(maker.random.choice(["sphere", "plate", "disk"])))(dark=True, depth=(-80, -20))
 
 
+def _narrow(maker: _Maker) -> None:
+    """Wires, grains of dust and slits far narrower than a pixel before a wide plate."""
+    maker.backdrop()
+    for _ in range(int(maker.random.integers(1, 5))):
+        getattr(maker, str(maker.random.choice(["grain", "wire", "slit"])))()
+
+
 def _stops(maker: _Maker) -> None:
     """Lens border and diaphragm apart, or an image-plane stop."""
     r = maker.random
@@ -405,7 +458,11 @@ EDGE_ON_FAMILIES: dict[str, Callable[[_Maker], None]] = {
     f"{name} edge-on": _in_turn(_edge_on, FAMILIES[name])
     for name in ("cylinders", "plates", "bitmaps", "exit laws", "stops", "centre", "crops", "panes and mirrors")
 }
-ALL_FAMILIES = {**FAMILIES, **MESH_FAMILIES, **EDGE_ON_FAMILIES}
+NARROW_FAMILIES: dict[str, Callable[[_Maker], None]] = {
+    "narrow dark bodies": _narrow,
+    "narrow before boxes": _in_turn(_narrow, FAMILIES["boxes"]),
+}
+ALL_FAMILIES = {**FAMILIES, **MESH_FAMILIES, **EDGE_ON_FAMILIES, **NARROW_FAMILIES}
 
 
 def random_scene(family: str, seed: int, finer: int = 1) -> RandomScene:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...camera.window import Box, corners_of
 from ...emission.face_table import shape_number
-from ...emission.of_emitter import surfaces_of
+from ...emission.of_emitter import surface_of, surfaces_of
 from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import box_of, is_shaded_smoothly, shading_normals
 from ...jit.plugin_objects import made
@@ -175,6 +175,13 @@ def specular_bsdf(shape: mi.Shape) -> mi.BSDF | None:
 def lobes_of(bsdf: mi.BSDF) -> tuple[str, ...]:
     """Kinds of specular lobes of a BSDF, of the names of `DELTA` in their order."""
     return tuple(name for name, flag in DELTA.items() if mi.has_flag(bsdf.flags(), flag))
+
+
+def only_hides(shape: mi.Shape) -> bool:
+    """True for a shape that neither glows nor lets light through."""
+    if set(lobes_of(shape.bsdf())) - {"reflection"}:
+        return False
+    return not shape.is_emitter() or ((surface := surface_of(shape.emitter())) is not None and surface.brightest <= 0)
 
 
 def longest_course(scene: mi.Scene) -> int:

@@ -32,6 +32,7 @@ from ..quadrature import FLOAT32_FLOOR, Quadrature
 from ..shortcuts import Finding
 from ..solution import Solution
 from . import node_rules
+from .dark_bodies import DarkBodies
 from .draft import Draft
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
@@ -132,6 +133,7 @@ class _BlockImage:
 
     blocks, own : the present size; True where blocks are computed, False where larger ones gave their value
     edge : True for blocks on which the image may jump
+    narrow : True for blocks on which dark bodies, or openings between them, are narrow for a block
     blur : least blur radius of an edge on a block or a neighbour [pixels]
     draft, refined : image of the present blocks in the pupil form; True where transects were taken
     passed_on : error of the pixels of a block that follows from the errors of the blocks around [W/mm²/sr]
@@ -162,11 +164,14 @@ class _BlockImage:
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.computed, draft.given = grid.flat(self.own), grid.flat(self.value)
+        draft.set_dark(DarkBodies.seen(draft.view, blocks.window))
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
             blur, self.refined = _refine_blurred(draft)
             grid.lay((blur < BLURRED) & (draft.outline | parted(draft.coverage)), self.edge)
             grid.lay(blur * blocks.side, self.blur)
+            self.narrow = np.zeros(self.own.shape, bool)
+            grid.lay(draft.in_doubt(), self.narrow)
         else:
             draft.edge_on = grid.flat(self.edge_on_pixels(blocks.window))
             refine(draft, np.broadcast_to(0.0, grid.shape))
@@ -199,7 +204,7 @@ class _BlockImage:
 
         The errors of the others become those of their pixels.
         """
-        self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window)
+        self.edge = _spread(self.edge, 1) | _small_bodies(self._seen(), self.blocks.window) | self.narrow
         pixel = self.quadrature.pixel
         self.bent = BEND_GAIN[pixel] * _bend(self.value, self.blocks.side, pixel, self.own)
         self.passed_on = _propagated(self.error, self.blocks.side, pixel)

@@ -11,7 +11,9 @@ its nearer and its farther rim are edges of different blur on one pixel, of whic
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +35,7 @@ from ...jit.spectra import at_one_wavelength, scalar
 from ..lines.specular import Specular, transmission
 from .node_rules import PLASTIC, twelve
 
+NARROW = 0.1  # of the tolerance: pixels with more light of narrow spots, or shade, do not rely on lines of sight alone
 UNCERTAINTY = 2.0  # largest ratio of narrow light and its estimate
 OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
 # The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
@@ -120,7 +123,7 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
         here[there] &= _hidden(points[there], 2**k)
         here &= there & (points.apart < 1)
         if here.any():
-            on_pixels += _spread(light[here], points[here], reach, window.shape)
+            on_pixels += spread(light[here], points[here], reach, window.shape)
             radiance = max(radiance, float(points.radiance[here].max()))
     in_focus = points.on_pixels(light, window.shape)
     edge_on = _edge_on(points, light, window.shape)
@@ -261,7 +264,7 @@ def _edge_on(points: Points, light: Column, shape: tuple[int, int]) -> PixelArra
         here = (level == k) & (points.edge_on > 0) & points.near(reach, shape)
         if not here.any():
             continue
-        found += _spread(light[here], points[here], reach, shape)
+        found += spread(light[here], points[here], reach, shape)
         row, column = (np.floor(c[here]).astype(np.int64) + reach for c in (points.y, points.x))
         low, high = (np.full([n + 2 * reach for n in shape], end) for end in (np.inf, -np.inf))
         np.minimum.at(low, (row, column), points.signed_blur[here])
@@ -304,7 +307,7 @@ class _Cells:
         return np.bincount(self.number, weight, minlength=math.prod(self.shape)).reshape(self.shape)
 
 
-def _spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -> PixelArray:
+def spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) -> PixelArray:
     """Sums of `light` within `reach` pixels of each pixel of the window, (h, w)."""
     height, width = shape
     reach = min(reach, height + width)
@@ -324,8 +327,23 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
         elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
     else:
         elements = elements_of(shape, max(texels, FEWEST_ELEMENTS))
+
+    def radiance(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
+        return scalar(surface.radiance(si, to_lens, mi.Bool(True)))
+
+    hides = hidden and len(scene.shapes()) > 1
+    return points_of(elements, camera, radiance, partial(in_sight, scene, camera, specular) if hides else None)
+
+
+def points_of(
+    elements: Elements,
+    camera: Camera,
+    radiance: Callable[[mi.SurfaceInteraction3f, mi.Vector3f], mi.Float],
+    visible: Callable[[mi.Point3f, mi.Normal3f], mi.Bool] | None = None,
+) -> Points:
+    """Points all over elements, with their images; those that are not `visible` have no radiance."""
     counts = np.ones(elements.count, np.int64)
-    middles = _on_elements(surface, elements, camera, counts)
+    middles = _on_elements(elements, radiance, camera, counts)
     area, unit = middles.image.numpy(), np.maximum(np.abs(middles.blur.numpy()), 1)
     reach = _reach(elements, camera) / unit
     # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
@@ -333,9 +351,9 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     crossed = middles.edge_on.numpy() > 0
     thin = np.isfinite(reach) & ((area < WIDE * unit**2 * reach) | crossed) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
-    at = _on_elements(surface, elements, camera, counts)
-    if hidden and len(scene.shapes()) > 1:
-        at.radiance = dr.select(_in_sight(scene, camera, at.place, at.normal, specular), at.radiance, 0)
+    at = _on_elements(elements, radiance, camera, counts)
+    if visible:
+        at.radiance = dr.select(visible(at.place, at.normal), at.radiance, 0)
     columns = (at.radiance, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
@@ -364,7 +382,12 @@ class _OnElements:
     normal: mi.Normal3f
 
 
-def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, counts: Index) -> _OnElements:
+def _on_elements(
+    elements: Elements,
+    radiance: Callable[[mi.SurfaceInteraction3f, mi.Vector3f], mi.Float],
+    camera: Camera,
+    counts: Index,
+) -> _OnElements:
     """Values at `counts` points of each element, the first in its middle."""
     index, number = numbered(counts)
     sample = mi.Point2f(*(from_numpy(mi.Float, np.mod(0.5 + step * number, 1.0)) for step in PLASTIC))
@@ -376,16 +399,16 @@ def _on_elements(surface: EmittingSurface, elements: Elements, camera: Camera, c
     cosine = dr.dot(si.n, to_lens)
     image = area * dr.abs(cosine / (dr.dot(camera.axis, to_lens) * dr.square(scale)))
     front = dr.dot(si.n, camera.to_world @ mi.Point3f(0) - si.p)
-    radiance, place = scalar(surface.radiance(si, to_lens, mi.Bool(True))), camera.film_map.from_ideal(centre)
+    place = camera.film_map.from_ideal(centre)
     # The rim below lies as far under the middle of the pupil as the rim above lies over it.
     edge_on = dr.select((cosine > 0) & (2 * front <= dr.dot(si.n, to_rim)), mi.Float(1), 0)
-    at = _OnElements(radiance, image, cosine, front, edge_on, blur, place, si.p, si.n)
+    at = _OnElements(radiance(si, to_lens), image, cosine, front, edge_on, blur, place, si.p, si.n)
     dr.eval(at)
     return at
 
 
-def _in_sight(
-    scene: mi.Scene, camera: Camera, place: mi.Point3f, normal: mi.Normal3f, specular: Specular | None
+def in_sight(
+    scene: mi.Scene, camera: Camera, specular: Specular | None, place: mi.Point3f, normal: mi.Normal3f
 ) -> mi.Bool:
     """True for points that one of twelve points of the pupil is visible from."""
     x, y = (mi.Float(column) for column in twelve(False).pupil.T)

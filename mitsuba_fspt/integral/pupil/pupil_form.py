@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ...jit.pixel_grid import Mask, PixelArray
+    from .dark_bodies import DarkBodies
     from .narrow import NarrowLight
 
 # Lines of sight of a pixel that twelve nodes leave above the tolerance, as of a straight silhouette; the same where the
@@ -66,16 +67,20 @@ def solve(
     progress: Progress = SILENT,
     by_faces: ByFaces | None = None,
     on_faces: NDArray[np.bool_] | None = None,
+    dark: DarkBodies | None = None,
 ) -> Solution:
     """Power [W], error [W] and coverage on every pixel of the crop window, to the accuracy of `quadrature`.
 
     Only pixels of the `window` are computed, the others are dark. `narrow`: light of the surfaces on them; that of
-    narrow spots counts as an error unless the lines of sight of a pixel suffice to meet it. Pixels that the partial
-    solution `given` has are not refined. `least_peak`: lower bound of the brightest pixel's mean radiance on film
+    narrow spots, and narrow shade of `dark` bodies and light between them, count as errors unless the lines of sight
+    of a pixel suffice to meet them. Pixels that the partial solution `given` has are not refined. `least_peak`: lower
+    bound of the brightest pixel's mean radiance on film
     [W/mm²/sr]. `progress` is called after every level. `by_faces`, `on_faces` as of `refine`.
     """
     draft = Draft(view, window, quadrature, given, least_peak, progress)
     draft.set_narrow(narrow)
+    if dark:
+        draft.set_dark(dark)
     refine(draft, narrow.in_focus, by_faces, on_faces)
     return draft.solution()
 
@@ -158,7 +163,7 @@ class _Faces:
         of sight for each of them."""
         draft, grid = self.draft, self.draft.grid
         visible = grid.array(draft.shown & draft.computed & ~(draft.clipped | draft.outside))
-        allowed = visible & draft.window.fully_open(draft.camera)
+        allowed = visible & draft.window.fully_open(draft.camera) & ~grid.array(draft.in_doubt())
         wanted, forced = grid.array(rough) & allowed, self.narrow & allowed
         if not self.taken and draft.progress.deadline.passed():
             self.narrow[:] = False

@@ -216,7 +216,8 @@ def _by_faces(
     del columns
     laid.clear()  # the work that follows needs the memory
     rough, cut, outside, off = _rough(scene, camera, entries, image, rtol)
-    sums = np.where(exact, entries.column_sums(), np.nan)
+    sums = entries.column_sums()
+    sums[~exact | (sums <= 0)] = np.nan  # lines of sight may meet light through an opening too narrow for faces
     if outside.any() or cut.any():
         sizes = np.diff(entries.starts)
         sums[entries.columns[np.repeat(outside | cut, sizes)]] = np.nan  # the stop takes some of their light

@@ -172,7 +172,7 @@ class FaceImage:
         """Further levels on the pixels `where` until their errors are below the tolerance; `worth`: of a number of
         pixels, lines of sight in whose time the next level has to be computed."""
         shown, mark = self.window.shown(), where
-        safety = np.where(self._shaded, SHADED, SAFETY)
+        safety = np.where(self.shaded, SHADED, SAFETY)
         while self.level < MOST_LEVELS - 1 and mark.any() and not progress.deadline.passed():
             level, around = self.level + 1, _wider(mark)
             plans = self._finer(self.plans, ColumnRule.of(self.quadrature.rtol), level, least_peak)
@@ -243,7 +243,7 @@ class FaceImage:
         return plans
 
     @cached_property
-    def _shaded(self) -> NDArray[np.bool_]:
+    def shaded(self) -> NDArray[np.bool_]:
         """True (h, w) for pixels that light of faces in a shadow's edge may reach."""
         steps = np.zeros(np.add(self.window.shape, 1), np.int64)
         size = np.array(self.window.shape[::-1])
