@@ -155,10 +155,15 @@ def reduce(
 
 
 def _required(counts: list[Path] | None, detector: Path | None, output: Path | None) -> tuple[list[Path], Path, Path]:
-    """The files that are needed unless a vignetting is measured; DetectorError for a missing one."""
+    """The files that are needed unless a vignetting is measured; DetectorError for a missing one, ImageError for counts
+    that are none, before other options are asked for."""
+    from ..detector.counts import require_suffix
+
     for name, value in (("COUNTS", counts), ("--detector", detector), ("-o", output)):
         if not value:
             raise DetectorError(f"reduce: {name} is missing. Give 'fspt reduce COUNTS --detector CAMERA.toml -o OUT'.")
+    for path in counts or ():
+        require_suffix(path)
     return counts, detector, output  # type: ignore[return-value]  # all are there
 
 

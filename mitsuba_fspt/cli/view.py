@@ -38,7 +38,8 @@ def view(
 
     def ready(address: str) -> None:
         text = f"{address}  (Ctrl-C ends it)"
-        print_result(text, {"address": address, "scene": str(scene)}, as_json=as_json, quiet=quiet)
+        # Without a browser nothing else tells where the page is.
+        print_result(text, {"address": address, "scene": str(scene)}, as_json=as_json, quiet=quiet and browser)
         if browser:
             webbrowser.open(address)
 

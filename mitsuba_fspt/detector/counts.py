@@ -211,8 +211,7 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
     path = Path(path)
     if path.is_dir():
         return _click(path)
-    if not path.is_file():
-        raise ImageError(f"counts '{path}' do not exist. Check the name.")
+    require_suffix(path)
     if path.suffix.lower() in (*TIFF, *FITS):
         _require_counts(path)
     thing = f"counts '{path}'"
@@ -224,6 +223,15 @@ def read_counts(path: str | os.PathLike[str], frames: int | None = None) -> Coun
         )
     array = array.astype(np.uint8) if array.dtype == bool else array  # a frame of bad pixels
     return replace(counts_of(array, str(path), frames), **header)
+
+
+def require_suffix(path: Path) -> None:
+    """Raise ImageError for counts that are not there, or in a format of images alone; folders are not checked."""
+    if not path.exists():
+        raise ImageError(f"counts '{path}' do not exist. Check the name.")
+    if path.is_file() and path.suffix.lower() not in (*TIFF, *FITS, ".npy"):
+        _require_counts(path)
+        raise ImageError(f"counts '{path}': '{path.suffix}' is not read. Give .tif, .fits or .npy.")
 
 
 def _require_counts(path: Path) -> None:

@@ -497,8 +497,8 @@ def tell_misfit(verb: str, chi2_sum: float, pixels: int, fitted: float, noise: S
     elif chi2_sum < least - chance and chi2_sum < WIDE * least:
         text = (
             f"chi2 is {chi2:.3g}, the images differ from the fit by less than their noise: it is stated too large, and "
-            f"intervals are about {(least / max(chi2_sum, 1e-300)) ** 0.5:.2g} times too wide. Check read noise and "
-            "gain of the detector, and whether images are means of several frames."
+            f"intervals are about {(least / max(chi2_sum, 1e-300)) ** 0.5:.2g} times too wide. Check where their "
+            "errors come from: read noise and gain of a detector, means of several frames, few passes of a Monte Carlo."
         )
     return told(verb, [text] if text else [])
 

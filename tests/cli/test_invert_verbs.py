@@ -155,6 +155,7 @@ def test_bad_input_of_reduce(run, folder, monkeypatch, tmp_path):
     for arguments, words in (
         (("counts_0.npy", "--detector", "camera.toml", "-o", "x.exr", "--wavelength-nm", 650), "exposure time"),
         (("none.tif", "--detector", "camera.toml", *SETTINGS, "-o", "x.exr"), "do not exist"),
+        (("exposure_0.exr", "--detector", "camera.toml", "-o", "x.exr"), "as of 'fspt expose --counts'"),
         (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.png"), "must end in"),
         (("counts_0.npy", "--detector", "none.toml", *SETTINGS, "-o", "x.exr"), "none.toml"),
         (("counts_0.npy", "--detector", "camera.toml", *SETTINGS, "-o", "x.exr", "--radiance", 1), "--calibrate"),

@@ -114,6 +114,18 @@ def test_a_port_in_use_is_one_line(run, tmp_path):
     assert err == f"fspt: port: {port} is in use on 127.0.0.1. Give another one, or 0 for any free one.\n"
 
 
+def test_quiet_tells_the_address_where_no_browser_is_opened(run, tmp_path, monkeypatch):
+    """Seen to fail: nothing on stdout, so that nobody could open the page."""
+    from mitsuba_fspt.cli import view
+
+    (tmp_path / "box.xml").write_text(SCENE)
+    monkeypatch.setattr("mitsuba_fspt.viewer.view.view", lambda scene, ready, **others: ready("http://here/?token=a"))
+    monkeypatch.setattr(view.webbrowser, "open", lambda address: None)
+    arguments = ("view", tmp_path / "box.xml", "--quiet")
+    assert run(*arguments, "--no-browser")[1].startswith("http://here/?token=a")
+    assert run(*arguments)[1] == ""
+
+
 @pytest.mark.parametrize("arguments", [("missing.xml",), ("box.xml", "-D", "f_number=-1"), ("box.xml", "--port", "-1")])
 def test_bad_input_opens_no_page(run, tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
