@@ -26,7 +26,12 @@ DTYPES = {
 
 
 def from_numpy(kind: type, values: ArrayLike) -> Any:
-    """Array of Dr.Jit of a flat `kind`, such as `mi.Float`, with these values row by row, and a packet behind them."""
+    """Array of Dr.Jit of a flat `kind`, such as `mi.Float`, with these values row by row, and a packet behind them.
+
+    ValueError for masked values, which Dr.Jit would take as numbers.
+    """
+    if np.ma.is_masked(values):
+        raise ValueError("from_numpy: the array has masked values. Give numbers for them, as by values.filled(0).")
     flat = np.ravel(values)
     own = np.zeros(len(flat) + PACKET, DTYPES[dr.type_v(kind)])
     own[: len(flat)] = flat

@@ -51,6 +51,15 @@ def test_values_are_converted_row_by_row(mono):
     assert len(from_numpy(mono.Float, [])) == 0
 
 
+def test_masked_values_are_refused(mono):
+    from mitsuba_fspt.jit.from_numpy import from_numpy
+
+    values = np.ma.masked_array([1.0, 540.0], [False, True])
+    with pytest.raises(ValueError, match="masked values"):
+        from_numpy(mono.Float, values)
+    assert list(from_numpy(mono.Float, values.filled(0))) == [1, 0]
+
+
 def test_nobody_gives_numpy_arrays_to_kernels_by_another_way():
     """No array that NumPy makes or converts is the argument of a type of Mitsuba, as in `mi.Float(x.astype(…))`."""
     found = []
