@@ -298,9 +298,10 @@ class FaceLines:
         i, j = self.number % self.m, self.number // self.m % self.m
         within, aim = pupil_cells.strata(i, j, self.m, face * pupil_cells.STRIDE + part)
         point = elements.place(face, within, self.cut, part)[0].p
+        b = mi.warp.square_to_uniform_triangle(within)  # on slender pieces they do not follow from the point
         aim = dr.select(lit_part.some, node, aim)
         lit = ~hidden(scene, point, middle.n, camera.open_arrival(point, aim)[1], active)
-        return _Shadow(ends, lit_part, point, aim, lit)
+        return _Shadow(lit_part, point, [1 - b.x - b.y, b.x, b.y], aim, lit)
 
 
 @dataclass(frozen=True)
@@ -337,12 +338,12 @@ class _Image:
 
 @dataclass(frozen=True)
 class _Shadow:
-    """What other surfaces hide of pieces with the corners `ends`: the `part` of each that is lit, and whether a random
-    `point` of it is lit from the point `aim` of the pupil."""
+    """What other surfaces hide of pieces: the `part` of each that is lit, and whether a random `point` of it, with its
+    barycentric coordinates `shares`, is lit from the point `aim` of the pupil."""
 
-    ends: list[mi.Point3f]
     part: LitPart
     point: mi.Point3f
+    shares: list[mi.Float]
     aim: mi.Point2f
     lit: mi.Bool
 
@@ -356,11 +357,10 @@ class _Shadow:
 
     def spot(self, camera: Camera, origin: mi.Vector2f, area: mi.Float64, wide: mi.Bool, active: mi.Bool) -> _Spot:
         """The random points at which that is wrong, for images of this `area` [pixels²]."""
-        shares, within = self.part.contains(self.ends, self.point)
-        within = dr.select(self.part.some, within, self.laid(wide))
+        within = dr.select(self.part.some, self.part.contains(self.point), self.laid(wide))
         place = mi.Point2d(camera.open_arrival(self.point, self.aim)[0] - origin)
         wrong = active & (self.lit != within)
-        return _Spot(shares, dr.select(self.lit, area, -area), place, wrong, self.part.some)
+        return _Spot(self.shares, dr.select(self.lit, area, -area), place, wrong, self.part.some)
 
 
 @dataclass(frozen=True)

@@ -90,13 +90,12 @@ class LitPart:
         along, beyond = _shadow_edge(place)
         return cls(some, ~some & (seen[0] | ~active), first, second, third, lit, along, beyond)
 
-    def contains(self, ends: list[mi.Point3f], point: mi.Point3f) -> tuple[list[mi.Float], mi.Bool]:
-        """Barycentric coordinates of points of triangles, and whether they are lit where an edge crosses one."""
-        x, y = _coordinates(ends, point)
+    def contains(self, point: mi.Point3f) -> mi.Bool:
+        """Whether points of triangles are lit, where an edge crosses one."""
         u, v = _coordinates([self.first, self.second, self.third], point)
         u, v = u / dr.maximum(self.along.x, 1e-6), v / dr.maximum(self.along.y, 1e-6)
         corner = u + v < 1 + self.beyond * dr.maximum(1 - dr.square(u - v), 0)
-        return [1 - x - y, x, y], corner == self.lit
+        return corner == self.lit
 
     def of_image(
         self,
