@@ -831,14 +831,14 @@ MUTANTS = (
     ),
     Mutant(
         "shade of narrow bodies",
-        "integral/pupil/draft.py",
-        "return self.shade * self.grid.spread_max(self.value)",
-        "return 0 * self.shade",
+        "integral/pupil/dark_bodies.py",
+        "np.maximum(self.shade * behind - self.light, 0)",
+        "np.maximum(0 * behind - self.light, 0)",
         ("tests/integral/test_dark_bodies.py",),
     ),
     Mutant(
         "light through narrow openings",
-        "integral/pupil/draft.py",
+        "integral/pupil/dark_bodies.py",
         "for reach, change in self.openings:",
         "for reach, change in self.openings[:0]:",
         ("tests/integral/test_dark_bodies.py",),

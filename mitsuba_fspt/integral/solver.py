@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from ..camera.camera import Camera
 from ..camera.window import Boxes, Window, window_of
@@ -32,8 +31,8 @@ from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.dark_bodies import DarkBodies
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NARROW, UNCERTAINTY, NarrowLight, edge_on_light, peak_of_points
-from .pupil.seen_points import SeenPoints
+from .pupil.narrow import NARROW, edge_on_light, peak_of_points
+from .pupil.seen_points import SeenPoints, Unseen
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
 from .solution import Solution
@@ -55,7 +54,7 @@ class Solver:
     def __init__(self) -> None:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
-        self._window, self._narrow, self._edge_on, self._dark = (CachedValue() for _ in range(4))
+        self._window, self._unseen, self._edge_on = (CachedValue() for _ in range(3))
         self._faces, self._seen_faces, self._grid_of_blocks = (CachedValue() for _ in range(3))
 
     def solve(
@@ -148,16 +147,11 @@ class Solver:
             return find()
         return self._seen_faces.recall(state, find, [geometry_of(shape) for shape in shapes])
 
-    def _narrow_light(self, view: View, window: Window) -> tuple[NarrowLight, NarrowLight, NDArray[np.float64]]:
-        """Light of bodies and spots that lines of sight may miss, as of `SeenPoints.narrow_light`; cached."""
+    def _unseen_on(self, view: View, window: Window) -> Unseen:
+        """Light and shade that lines of sight may miss on the pixels of a window; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
         state = _seen_state(view, window)
-        return self._narrow.recall(state, lambda: SeenPoints.of(view).narrow_light(window), held)
-
-    def _dark_bodies(self, view: View, window: Window) -> DarkBodies:
-        """What bodies without light hide and let through on the pixels of a window; cached."""
-        held = [geometry_of(shape) for shape in view.scene.shapes()]
-        return self._dark.recall(_seen_state(view, window), lambda: DarkBodies.seen(view, window), held)
+        return self._unseen.recall(state, lambda: SeenPoints.of(view).unseen(window), held)
 
     def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
         """`NarrowLight.edge_on` on the pixels of a window; cached."""
@@ -182,18 +176,15 @@ class Solver:
             points = SeenPoints.of(view)
             least_peak = max(pupil_form.peak_of_few(view, window, quadrature), peak_of_points(points.straight, window))
         for k, tile in enumerate(tiles):
-            light = partial(points.narrow_light, tile) if points else partial(self._narrow_light, view, tile)
-            dark = partial(self._dark_bodies, view, tile) if narrow else partial(DarkBodies.none, tile.shape)
-            part = progress.part(k, len(tiles))
-            mosaic.put(tile, self._solve_tile(tile, view, quadrature, light, dark, least_peak, part))
+            unseen = partial(points.unseen, tile) if points else partial(self._unseen_on, view, tile)
+            mosaic.put(tile, self._solve_tile(tile, view, quadrature, unseen, least_peak, progress.part(k, len(tiles))))
 
     def _solve_tile(
         self,
         window: Window,
         view: View,
         quadrature: Quadrature,
-        narrow_light: Callable[[], tuple[NarrowLight, NarrowLight, NDArray[np.float64]]],
-        dark_bodies: Callable[[], DarkBodies],
+        find_unseen: Callable[[], Unseen],
         least_peak: float,
         progress: Progress,
     ) -> Solution:
@@ -207,14 +198,14 @@ class Solver:
         inside, cut = window.field_stop(camera)
         everywhere = quadrature.domain == "surface"
         if everywhere and not cut.any():
-            return self._by_surface(window, view, quadrature, dark_bodies().shade, least_peak, progress)
+            return self._by_surface(window, view, quadrature, least_peak, progress)
         blocks, why = self._blocks(view, window, quadrature)
         if blocks:
             if solution := self._by_blocks(view, blocks, quadrature, least_peak, progress):
                 return solution
             why = "most blocks of pixels have an edge, or light too narrow for them"
-        narrow, elsewhere, anywhere = narrow_light()
-        dark = dark_bodies()
+        unseen = find_unseen()
+        narrow, dark = unseen.straight, unseen.dark
         where, peak = inside, least_peak
         if not everywhere:
             where = inside & (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak))
@@ -236,25 +227,18 @@ class Solver:
         elif by_faces:
             solution = form(narrow, None, least_peak, progress, by_faces, on_faces)
         elif specular and specular.bending and specular.branching:
-            solution = _by_courses(view, window, quadrature, narrow, elsewhere, dark, least_peak, progress)
+            solution = _by_courses(view, window, quadrature, unseen, least_peak, progress)
         else:
-            solution = form(narrow.plus(elsewhere), None, least_peak, progress)
-        error = np.maximum(solution.error, window.expand(anywhere) * camera.etendue)
+            solution = form(narrow.plus(unseen.elsewhere), None, least_peak, progress)
+        error = np.maximum(solution.error, window.expand(unseen.anywhere) * camera.etendue)
         findings = (Finding("smooth blocks", False, why), *solution.findings)
         solution = replace(solution, error=error, findings=findings)
-        return _with_shade(solution, window, dark.shade) if everywhere else solution
+        return _with_dark_bodies(solution, view, window, dark) if everywhere else solution
 
     def _by_surface(
-        self,
-        window: Window,
-        view: View,
-        quadrature: Quadrature,
-        shade: NDArray[np.float64],
-        least_peak: float,
-        progress: Progress,
+        self, window: Window, view: View, quadrature: Quadrature, least_peak: float, progress: Progress
     ) -> Solution:
-        """Solution by the surface form alone: from the faces of meshes, from elements of other surfaces; `shade` as of
-        `DarkBodies`."""
+        """Solution by the surface form alone: from the faces of meshes, from elements of other surfaces."""
         scene, camera = view.scene, view.camera
         dark_too = not quadrature.takes("dark")
         by_faces = self._face_image(window, view, quadrature, least_peak, dark_too)
@@ -262,10 +246,12 @@ class Solver:
             known = by_faces.run(np.ones(window.shape, bool), least_peak, progress, surface_form.MOST_LINES)
             if progress.log:
                 progress.log.add("images of faces", window.count, known.rays)
-            shade = np.where(by_faces.shaded, 0, shade)  # faces that shadows cross have them
+            shaded = by_faces.shaded  # faces that shadows cross have them
         else:
             known = surface_form.solve(scene, camera, window, quadrature, None, least_peak, progress, view.specular)
-        return _with_shade(_with_dark_coverage(known, view, window), window, shade)
+            shaded = np.zeros(window.shape, bool)
+        found, dark = _with_dark_coverage(known, view, window), DarkBodies.seen(view, window)
+        return _with_dark_bodies(found, view, window, replace(dark, shade=np.where(shaded, 0, dark.shade)))
 
     def _face_image(
         self, window: Window, view: View, quadrature: Quadrature, least_peak: float, dark_too: bool = True
@@ -294,7 +280,7 @@ class Solver:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
         # Light that is narrow for a pixel is narrow for a block, too.
         largest = blocks[0]
-        narrow, *_ = self._narrow_light(replace(view, camera=largest.camera), largest.window)
+        narrow = self._unseen_on(replace(view, camera=largest.camera), largest.window).straight
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
         edge_on = partial(self._light_edge_on, view)
@@ -324,9 +310,7 @@ def _by_courses(
     view: View,
     window: Window,
     quadrature: Quadrature,
-    narrow: NarrowLight,
-    elsewhere: NarrowLight,
-    dark: DarkBodies,
+    unseen: Unseen,
     least_peak: float,
     progress: Progress,
 ) -> Solution:
@@ -345,9 +329,10 @@ def _by_courses(
         shares[0] = replace(shares[0], max_nodes=max(quadrature.max_nodes - few, 1))
     shares[1] = replace(shares[1], max_nodes=few)
     first, rest = progress.part(0, 2), progress.part(1, 2)
-    image = pupil_form.solve(views[0], window, shares[0], narrow.plus(elsewhere), None, least_peak, first, dark=dark)
+    narrow = unseen.straight.plus(unseen.elsewhere)
+    image = pupil_form.solve(views[0], window, shares[0], narrow, None, least_peak, first, dark=unseen.dark)
     peak = max(float((image.power - image.error).max(initial=0.0)) / view.camera.etendue, least_peak)
-    others = replace(elsewhere, in_focus=narrow.in_focus)
+    others = replace(unseen.elsewhere, in_focus=unseen.straight.in_focus)
     return image.plus(pupil_form.solve(views[1], window, shares[1], others, None, peak, rest))
 
 
@@ -359,10 +344,13 @@ def _with_dark_coverage(solution: Solution, view: View, window: Window) -> Solut
     return replace(solution, coverage=np.maximum(solution.coverage, met))
 
 
-def _with_shade(solution: Solution, window: Window, shade: NDArray[np.float64]) -> Solution:
-    """The surface form's `solution`, with the `shade` (h, w) of narrow bodies, which that form may miss, as error."""
-    hidden = window.expand(np.minimum(UNCERTAINTY * shade, 1)) * maximum_filter(solution.power, 3)
-    return replace(solution, error=np.maximum(solution.error, hidden))
+def _with_dark_bodies(solution: Solution, view: View, window: Window, dark: DarkBodies) -> Solution:
+    """The surface form's `solution`; what narrow dark bodies hide, and what passes between them, is an error, as that
+    form may miss both."""
+    etendue = view.camera.etendue
+    light = window.cut(solution.power) / etendue
+    missed = np.maximum(dark.taken(light), dark.let_through(light)) * etendue
+    return replace(solution, error=np.maximum(solution.error, window.expand(missed)))
 
 
 def _outside(window: Window) -> Finding:

@@ -185,7 +185,7 @@ class _Maker:
     def backdrop(self) -> None:
         """A glowing plate that fills the field, behind the bodies in the middle."""
         half = 0.8 * self.field_width
-        centre = np.array([0.0, 0.0, self.focus + float(self.random.uniform(40, 60))])
+        centre = np.array([0.0, 0.0, self.focus + float(self.random.uniform(60, 80))])
         turn = np.diag([-1.0, 1.0, -1.0])
         shape = Simple(Rectangle(centre, turn[:, 0] * half, turn[:, 1] * half))
         self.glowing(shape, {"type": "rectangle", "to_world": _matrix(turn * [half, half, 1], centre)})

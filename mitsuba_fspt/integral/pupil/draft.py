@@ -18,7 +18,7 @@ from ..progress import SILENT, Progress
 from ..quadrature import Quadrature
 from ..solution import Solution
 from . import node_rules
-from .narrow import NARROW, OUTSHINES, UNCERTAINTY
+from .narrow import NARROW
 
 if TYPE_CHECKING:
     from ...jit.pixel_grid import Mask, PixelArray
@@ -47,8 +47,7 @@ class Draft:
     edge_on : light of surfaces edge-on as of `NarrowLight`, 0 unless it is set [W/mm²/sr]
     missed, narrow_radiance : light of narrow spots, and at last through narrow openings, that lines of sight may miss,
         and the largest radiance of these, 0 unless they are set [W/mm²/sr]
-    shade : share of the lines of sight that narrow dark bodies block, which the nodes may miss, 0 unless it is set
-    openings : changes of the radiance across borders of dark bodies, as of `DarkBodies`, none unless they are set
+    dark : dark bodies on the window, None unless they are set
     by_narrow : True where that light or shade alone makes the error larger than the tolerance
     outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
     shown : False on the rim of the window; one entry if there is none
@@ -79,9 +78,9 @@ class Draft:
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness, self.lost, self.edge_on = (grid.full(mi.Float64, 0) for _ in range(3))
-        self.missed, self.shade = (grid.full(mi.Float64, 0) for _ in range(2))
+        self.missed = grid.full(mi.Float64, 0)
         self.narrow_radiance, self.by_narrow = 0.0, mi.Bool(False)
-        self.openings: list[tuple[int, PixelArray]] = []
+        self.dark: DarkBodies | None = None
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
         self.clipped, self.outside = (grid.full(mi.Bool, False) for _ in range(2))
         if math.isfinite(view.camera.lens.seen_field):
@@ -159,38 +158,32 @@ class Draft:
 
     def set_dark(self, dark: DarkBodies) -> None:
         """Set what dark bodies hide, and what passes between them, that lines of sight may miss."""
-        self.shade = self.grid.flat(np.minimum(UNCERTAINTY * dark.shade, 1))
-        self.openings = [(reach, self.grid.flat(change)) for reach, change in dark.openings]
+        self.dark = dark
         most = (float(change.max(initial=0.0)) for _, change in dark.openings)
         self.narrow_radiance = max(self.narrow_radiance, *most, 0.0)
 
     def in_doubt(self) -> Mask:
         """Pixels on which dark bodies may take or let through more light than nodes show."""
-        light = dr.maximum(self.shaded_light(), self.light_through_openings())
+        light = dr.maximum(*self._by_dark_bodies())
         return light > dr.opaque(mi.Float64, NARROW) * self.tolerance
+
+    def _by_dark_bodies(self) -> tuple[PixelArray, PixelArray]:
+        """Largest light that dark bodies take from each pixel, and let through to it [W/mm²/sr]."""
+        zero = self.grid.full(mi.Float64, 0)
+        if self.dark is None or not (self.dark.openings or self.dark.shade.any()):
+            return zero, zero
+        light = np.zeros(self.grid.shape)
+        self.grid.lay(self.value, light)
+        return self.grid.flat(self.dark.taken(light)), self.grid.flat(self.dark.let_through(light))
 
     def count_missed(self) -> None:
         """Count narrow light and shade as errors of the pixels that no other solution gives."""
-        self.missed = dr.maximum(self.missed, self.light_through_openings())
-        missed = dr.maximum(self.missed, self.shaded_light())
+        taken, let_through = self._by_dark_bodies()
+        self.missed = dr.maximum(self.missed, let_through)
+        missed = dr.maximum(self.missed, taken)
         error = dr.select(self.computed, dr.maximum(self.error, missed), self.error)
         self.by_narrow = (self.error <= self.tolerance) & (error > self.tolerance)
         self.error = error
-
-    def shaded_light(self) -> PixelArray:
-        """Largest light that narrow dark bodies take from each pixel [W/mm²/sr]."""
-        return self.shade * self.grid.spread_max(self.value)
-
-    def light_through_openings(self) -> PixelArray:
-        """Largest light on each pixel through openings of dark bodies that are too narrow for nodes [W/mm²/sr].
-
-        Beside a wide opening a pixel has half of the light that passes, at least.
-        """
-        light = self.grid.full(mi.Float64, 0)
-        for reach, change in self.openings:
-            wide = change <= dr.opaque(mi.Float64, OUTSHINES) * self.grid.spread_max(self.value, reach)
-            light = dr.maximum(light, self.grid.spread_max(dr.select(wide, 0, change), reach))
-        return light
 
     def count(self, what: str, pixels: mi.UInt32, rays: int) -> None:
         """Record the name of a rule, the numbers of the pixels it was applied to, and their lines of sight."""

@@ -345,7 +345,8 @@ def points_of(
     counts = np.ones(elements.count, np.int64)
     middles = _on_elements(elements, radiance, camera, counts)
     area, unit = middles.image.numpy(), np.maximum(np.abs(middles.blur.numpy()), 1)
-    reach = _reach(elements, camera) / unit
+    with np.errstate(invalid="ignore"):  # of elements without an image, which have no radiance
+        reach = _reach(elements, camera) / unit
     # A long and thin element is represented by many points, a quarter of a unit apart, any other by one.
     long = np.isfinite(reach) & (reach > MOST_POINTS)  # `MOST_POINTS` points would be too far apart
     crossed = middles.edge_on.numpy() > 0

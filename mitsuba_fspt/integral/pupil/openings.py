@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -19,44 +20,58 @@ from ...camera.camera import Camera
 from ...camera.window import Window
 from ...emission.elements import elements_of
 from ...jit.from_numpy import from_numpy
-from ...jit.mesh_buffers import corners_of_faces
+from ...jit.mesh_buffers import triangles
 from ..lines.eq9 import View
 from ..lines.specular import only_hides
+from .shade import placeable
 
 # Pixels between a border and the lines of sight beside it, at least `ROUNDED` times what float32 displaces these by;
 # narrower openings are not detected. Shortest border [pixels].
 BESIDE, ROUNDED, SHORTEST = 2e-3, 4.0, 1e-6
 APART = 0.25  # distance of points along a border [pixels, or blur radii where these are larger]
 MOST_POINTS = 1 << 12  # on one border
+MIXERS = tuple(np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9))  # odd, of a hash
 ENDS = 256  # borders along each end of a shape that is no mesh
-PUPIL = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))  # lines of sight of each point, unit disc
+MISPLACED, STEPS = 0.5, 32  # pixels by which a border may be off its place in another pose, and lines on that way
 
 Array = NDArray[np.float64]
 Openings = tuple[tuple[int, Array], ...]
 
 
-def openings(view: View, window: Window) -> Openings:
+@dataclass(frozen=True)
+class _Lines:
+    """Lines of sight near each point of a border: points of the `pupil`, unit disc; how far `aside` [pixels]."""
+
+    pupil: tuple[tuple[float, float], ...]
+    aside: tuple[float, ...]
+
+
+_STRAIGHT = _Lines(((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7)), (-BESIDE, BESIDE))
+_POSED = _Lines(((0.0, 0.0),), tuple(MISPLACED * (2 * k / STEPS - 1) for k in range(STEPS + 1)))
+
+
+def openings(view: View, window: Window, pose: Camera | None = None) -> Openings:
     """Reaches of borders of bodies without light, and for each the largest change of the radiance on film across such
     borders on each pixel of a window (h, w) [W/mm²/sr].
 
     The reach is the blur radius, or a pixel [pixels]. Borders outside that reach into the window count on the nearest
-    pixel.
+    pixel. `pose`: as of `shade.narrow_bodies`; it may be half a pixel off.
     """
-    camera = view.camera
-    ends = _borders(view.scene.shapes(), camera)
-    if not len(ends) or not math.prod(window.shape):
+    camera = pose or view.camera
+    ends = _borders(view.scene.shapes(), camera, window)
+    if not len(ends):
         return ()
     centre, blur = camera.film_discs(ends)
     known = np.isfinite(centre).all(axis=(1, 2)) & np.isfinite(blur).all(axis=(1, 2))
-    near = _near(centre, blur[..., 0].max(axis=1), window) & known
-    ends, centre, blur = ends[near], centre[near], blur[near, :, 0].max(axis=1)
+    near = _near(centre, blur, window) & known
+    ends, centre, blur = ends[near], centre[near], blur[near, :, 0].max(axis=1, initial=0.0)
     if not len(ends):
         return ()
     length = np.linalg.norm(centre[:, 1] - centre[:, 0], axis=1)
     counts = np.ceil(length / (APART * np.maximum(blur, 1))).clip(1, MOST_POINTS).astype(np.int64)
     border = np.repeat(np.arange(len(ends)), counts)
     share = (np.arange(len(border)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[border]
-    change = _change(view, ends[border], share)
+    change = _change(view, camera, ends[border], share, _POSED if pose else _STRAIGHT)
     level = np.round(np.log2(np.maximum(blur, 1))).astype(np.int64)[border]
     place = centre[border, 0] + share[:, None] * (centre[border, 1] - centre[border, 0]) - window.corner
     size, found = np.array(window.shape[::-1]), []
@@ -72,60 +87,73 @@ def openings(view: View, window: Window) -> Openings:
 
 
 def _near(centre: Array, blur: Array, window: Window) -> NDArray[np.bool_]:
-    """True for borders whose light may reach a window."""
-    low, high = centre.min(axis=1) - window.corner, centre.max(axis=1) - window.corner
-    reach = blur[:, None] + 1
-    size = np.array(window.shape[::-1])
-    return np.asarray(((high > -reach) & (low < size + reach)).all(axis=1))
+    """True for edges, or faces, whose light may reach a window; blur discs (n, k, 2) and (n, k, 1) of their k ends."""
+    low, high, reach = centre.min(axis=1), centre.max(axis=1), blur.max(axis=1) + 1
+    size, corner = np.array(window.shape[::-1]), np.array(window.corner)
+    outside = (high < corner - reach) | (low > corner + size + reach)  # of discs that are not known none is
+    return np.asarray(~outside.any(axis=1))
 
 
-def _change(view: View, ends: Array, share: Array) -> Array:
-    """Largest change of the radiance on film across each border at a share of its length [W/mm²/sr]."""
-    camera = view.camera
+def _change(view: View, camera: Camera, ends: Array, share: Array, lines: _Lines) -> Array:
+    """Largest change of the radiance on film across each border, as a `camera` sees it straight on, at a share of its
+    length [W/mm²/sr]."""
     points = [mi.Point3f(*(from_numpy(mi.Float, column) for column in at.T)) for at in ends.swapaxes(0, 1)]
-    along, beside = from_numpy(mi.Float, share), dr.opaque(mi.Float, max(BESIDE, ROUNDED * float(camera.rounding)))
+    along, least = from_numpy(mi.Float, share), ROUNDED * float(camera.rounding)
     most = dr.zeros(mi.Float, len(share))
-    for node in PUPIL:
+    for node in lines.pupil:
         pupil = mi.Point2f(*(dr.opaque(mi.Float, x) for x in node))
         first, last = (camera.arrival(point, pupil)[0] for point in points)
         middle = camera.arrival(dr.lerp(points[0], points[1], along), pupil)[0]
         way = last - first
-        aside = mi.Point2f(-way.y, way.x) * (beside / dr.maximum(dr.norm(way), SHORTEST))
-        left, right = (view.integrand(middle + side * aside, pupil).integrand for side in (1, -1))
-        most = dr.maximum(most, dr.abs(left - right))
+        across = mi.Point2f(-way.y, way.x) / dr.maximum(dr.norm(way), SHORTEST)
+        high, low = dr.zeros(mi.Float, len(share)), dr.full(mi.Float, dr.inf, len(share))
+        dr.eval(middle, across)
+        for aside in lines.aside:
+            place = middle + dr.opaque(mi.Float, math.copysign(max(abs(aside), least), aside)) * across
+            light = view.integrand(place, pupil).integrand
+            high, low = dr.maximum(high, light), dr.minimum(low, light)
+            dr.eval(high, low)
+        most = dr.maximum(most, high - low)
         dr.eval(most)
     return np.nan_to_num(most.numpy().astype(np.float64))
 
 
-def _borders(shapes: Sequence[mi.Shape], camera: Camera) -> Array:
-    """Ends (n, 2, 3) [mm] of the borders of all bodies that send no light."""
-    found = [_outlines(shape, camera) if shape.is_mesh() else _ends(shape) for shape in shapes if only_hides(shape)]
-    return np.concatenate(found) if found else np.zeros((0, 2, 3))
+def _borders(shapes: Sequence[mi.Shape], camera: Camera, window: Window) -> Array:
+    """Ends (n, 2, 3) [mm] of the borders of all bodies that do not glow."""
+    dark = [shape for shape in shapes if only_hides(shape) and placeable(shape)]
+    found = [_outlines(shape, camera, window) if shape.is_mesh() else _ends(shape) for shape in dark]
+    return np.concatenate([np.zeros((0, 2, 3)), *found])
 
 
-def _outlines(mesh: mi.Shape, camera: Camera) -> Array:
-    """Edges of a mesh between a face that a point of the pupil sees and none, or one that it does not see."""
-    corners = corners_of_faces(mesh)
-    if not len(corners):
+def _outlines(mesh: mi.Shape, camera: Camera, window: Window) -> Array:
+    """Edges of a mesh near a window that may be its outline: of a single face, or of one that some point of the pupil
+    sees from outside and one that some point does not.
+    """
+    positions, faces = (buffer.numpy().reshape(-1, 3) for buffer in triangles(mesh))
+    vertices = positions.astype(np.float64)
+    centre, blur = camera.film_discs(vertices)
+    faces = faces[_near(centre[faces], blur[faces], window)].astype(np.int64)
+    if not len(faces):
         return np.zeros((0, 2, 3))
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    high = np.einsum("fi,fi->f", normal, np.array(camera.centre) - corners[:, 0])
-    reach = camera.pupil_reach * np.linalg.norm(normal, axis=1)
-    index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
-    edge = np.sort(np.concatenate([index[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
-    both = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
-    number, first, group = _unique(edge)
-    front, back = (np.bincount(group, np.tile(side, 3), minlength=number) for side in (high > -reach, high < reach))
-    faces = np.bincount(group, minlength=number)
-    seen = (faces != 2) | ((front > 0) & (back > 0))
-    return np.asarray(both[first[seen]])
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    height = np.einsum("fi,fi->f", normal, np.array(camera.centre) - a)  # of the lens over the face, times its normal
+    pupil = camera.pupil_reach * np.linalg.norm(normal, axis=1)
+    number = _merged(positions)[faces]
+    edge = np.sort(np.concatenate([number[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    key = edge[:, 0] * (number.max() + 1) + edge[:, 1]
+    _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    front, back = (np.bincount(group, np.tile(side, 3)) for side in (height > -pupil, height < pupil))
+    some = first[(count != 2) | ((front > 0) & (back > 0))]
+    ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])[some]
+    return np.asarray(vertices[ends])
 
 
-def _unique(edge: NDArray[np.int64]) -> tuple[int, NDArray[np.int64], NDArray[np.int64]]:
-    """Number of different edges, the first of each, and the number of each one's."""
-    key = edge[:, 0] * (edge.max() + 1) + edge[:, 1]
-    _, first, group = np.unique(key, return_index=True, return_inverse=True)
-    return len(first), first, group
+def _merged(positions: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Numbers (V,) of vertices, the same for those at the same place."""
+    bits = (positions + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    mixed = bits[:, 0] * MIXERS[0] + bits[:, 1] * MIXERS[1] + bits[:, 2] * MIXERS[2]  # modulo 2⁶⁴
+    return np.unique(mixed, return_inverse=True)[1].astype(np.int64)
 
 
 def _ends(shape: mi.Shape) -> Array:

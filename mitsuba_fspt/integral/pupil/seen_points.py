@@ -17,11 +17,29 @@ from ..lines.eq9 import View
 from ..lines.pose import Pose, Unlocated
 from ..lines.poses import Poses
 from ..lines.visible_window import glowing_boxes
+from .dark_bodies import DarkBodies
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
 
+LEAST_SHARE = 0.25  # of the light, that courses have in which dark bodies are searched for
 MOST_BOXES = 8  # of what glows, one by one; the box around more of them counts in their place
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Light and shade on the pixels of a window that lines of sight may miss.
+
+    straight, elsewhere : light of narrow spots along straight lines and by specular surfaces; that elsewhere has
+        neither `in_focus` nor `brightest`
+    anywhere : that in poses that are not known, at the most on each pixel (h, w) [W/mm²/sr]
+    dark : shade and openings of dark bodies
+    """
+
+    straight: NarrowLight
+    elsewhere: NarrowLight
+    anywhere: Array
+    dark: DarkBodies
 
 
 @dataclass(frozen=True)
@@ -60,18 +78,26 @@ class SeenPoints:
         most = most_narrow_light(points_on_surfaces(scene, camera, hidden=False)) if poses.unlocated else 0.0
         return cls(view, straight, tuple(seen), (poses.unlocated, most))
 
-    def narrow_light(self, window: Window) -> tuple[NarrowLight, NarrowLight, Array]:
-        """Light of narrow spots on the pixels of a window: along straight lines, elsewhere, and, in poses that are
-        not known, at the most on each pixel (h, w) [W/mm²/sr].
-
-        That elsewhere has neither `in_focus` nor `brightest`.
-        """
-        straight, elsewhere = narrow_light(self.straight, window), NarrowLight.none(window.shape)
+    def unseen(self, window: Window) -> Unseen:
+        """What lines of sight may miss on the pixels of a window."""
+        elsewhere = NarrowLight.none(window.shape)
         for points, courses in self.elsewhere:
             share = _share(courses, window).clip(max=1)
             elsewhere = elsewhere.plus(narrow_light(points, window).times(share))
         lines, most = self.unlocated
-        return straight, elsewhere, most * _share(lines, window).clip(max=1)
+        anywhere = most * _share(lines, window).clip(max=1)
+        return Unseen(narrow_light(self.straight, window), elsewhere, anywhere, self._dark_bodies(window))
+
+    def _dark_bodies(self, window: Window) -> DarkBodies:
+        """What bodies without light hide, and what passes between them, along straight lines and elsewhere."""
+        if self.straight is None:
+            return DarkBodies.none(window.shape)
+        found = DarkBodies.seen(self.view, window)
+        for _, courses in self.elsewhere:
+            share = _share(courses, window).clip(max=1)
+            if share.max(initial=0.0) >= LEAST_SHARE:
+                found = found.plus(DarkBodies.seen(self.view, window, courses[0].camera), share)
+        return found
 
 
 def _share(courses: Sequence[Pose | Unlocated], window: Window) -> Array:

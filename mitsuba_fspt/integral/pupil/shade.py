@@ -1,14 +1,14 @@
-"""Shade of narrow bodies that send no light, such as wires and dust, which all nodes of a pixel may miss (Eq. M.5).
+"""Shade of narrow bodies, such as wires and dust, darker than what is behind, which all nodes may miss.
 
 As for light (`narrow`), points all over the bodies tell which pixels they may shade: a point blocks the share of the
-lines of sight of a pixel that its surroundings cover of the pixel, or of the blur disc where that is larger. Only parts
-of bodies that leave half of every square around them free are narrow; others are edges, which transects integrate.
+lines of sight of a pixel (Eq. M.5) that its surroundings cover of the pixel, or of the blur disc where that is larger.
+Parts of bodies that cover a third of a ring around them are not narrow, but edges, which transects integrate.
 """
 
 from __future__ import annotations
 
 import math
-from functools import partial
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,84 +16,115 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from ...camera.camera import Camera
 from ...camera.window import Window
 from ...emission.elements import elements_of
+from ...emission.emitting_surface import EmittingSurface
+from ...emission.of_emitter import surfaces_of
 from ...jit.from_numpy import from_numpy
-from ...jit.pixel_grid import Grid
+from ...jit.spectra import scalar
 from ..lines.eq9 import View
 from ..lines.specular import only_hides
-from .narrow import COVERED, FEWEST_ELEMENTS, Points, in_sight, points_of, spread
+from .narrow import FEWEST_ELEMENTS, Points, points_of, spread
 
-RING = 8  # lines of sight around a point
+# Shapes that are no meshes on which points can be placed by their parameters.
+PLACEABLE = ("Sphere", "Cylinder", "Disk", "BSplineCurve")
+# Lines of sight on a ring around a point, its radius [pixels, blur radii where these are larger], and the share of them
+# that end on the body: a quarter on a wire, a third or more on the outline of a body as wide as the ring.
+RING, RING_RADIUS, RING_COVERED = 8, 0.3, 0.3
+CELL = 0.25  # side of the cells of whose points one is examined for all, likewise
+ROUNDING = 1e-3  # of a radiance
 SHARP = 0.5  # blur radius [pixels] below which a point shades its own pixel and those beside it
 
 Column = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 PixelArray = NDArray[np.float64]
 
 
-def narrow_bodies(view: View) -> Points | None:
-    """Points all over the narrow parts of bodies that send no light and that others do not hide, of radiance 1; None
-    without any."""
-    scene, camera = view.scene, view.camera
-    visible = partial(in_sight, scene, camera, view.specular)
-    parts = [
-        points_of(elements_of(shape, 1 if shape.is_mesh() else FEWEST_ELEMENTS), camera, _one, visible)
-        for shape in scene.shapes()
-        if only_hides(shape)
-    ]
-    points = _narrow(view, Points.joined(parts)) if parts else None
+def narrow_bodies(view: View, window: Window, pose: Camera | None = None) -> Points | None:
+    """Points all over the narrow parts of bodies that do not glow, of radiance 0, and of those that glow, but less than
+    another one. None without any.
+
+    window : points far from it are left out
+    pose : of the camera, from which it sees them straight on by specular surfaces; None: the view's, and points that
+        other bodies hide from the middle of the pupil are left out
+    """
+    found, surfaces = [], surfaces_of(view.scene)
+    dark = [_points(view, pose, shape) for shape in view.scene.shapes() if only_hides(shape) and placeable(shape)]
+    if dark:
+        found.append(_narrow(view, window, Points.joined(dark), 0.0, pose is None))
+    most = max((surface.brightest for surface in surfaces), default=0.0)
+    for surface in surfaces:
+        if 0 < surface.brightest < most and placeable(surface.shape):
+            dim = _points(view, pose, surface.shape, surface)
+            brightest = (1 + ROUNDING) * float(dim.radiance.max(initial=0.0))
+            found.append(_narrow(view, window, dim, brightest, pose is None))
+    points = Points.joined(found) if found else None
     return points if points is not None and len(points.x) else None
 
 
-def _one(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
-    """Radiance of points whose light is the share of a pixel that they cover."""
-    return dr.full(mi.Float, 1, dr.width(si.p))
+def placeable(shape: mi.Shape) -> bool:
+    """True for a shape on which points can be placed."""
+    return shape.is_mesh() or shape.class_name() in PLACEABLE
 
 
-def _narrow(view: View, points: Points) -> Points:
-    """The points of parts that leave half of every square around them free, and half of a ring around them; square and
-    ring measure one pixel, or the blur radius where that is larger. Squares are blind to elements larger than them.
+def _points(view: View, pose: Camera | None, shape: mi.Shape, surface: EmittingSurface | None = None) -> Points:
+    """Points all over both sides of a shape, with the radiance of its `surface` if it glows."""
+
+    def radiance(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
+        return scalar(surface.radiance(si, to_lens, mi.Bool(True))) if surface else dr.zeros(mi.Float, dr.width(si.p))
+
+    points = points_of(elements_of(shape, 1 if shape.is_mesh() else FEWEST_ELEMENTS), pose or view.camera, radiance)
+    towards = points.front * np.sign(points.cosine) > 0  # the middle of the pupil lies on the side of the whole pupil
+    return replace(points, cosine=np.abs(points.cosine))[towards & (points.apart < 1) & (points.area > 0)]
+
+
+def _narrow(view: View, window: Window, points: Points, radiance: float, straight: bool) -> Points:
+    """The points around which most of a ring is free of bodies as dark.
+
+    radiance : largest one of these bodies [W/mm²/sr]
+    straight : leave out points that other bodies hide
     """
-    points = points[(points.area > 0) & (points.cosine > 0)]
+    unit, (left, top) = np.maximum(points.blur, 1), window.corner
+    near = replace(points, x=points.x - left, y=points.y - top).near(2 * unit, window.shape)
+    points, unit = points[near], unit[near]
     if not len(points.x):
         return points
-    level, narrow = points.level(), (points.apart < 1) & (points.radiance > 0)
-    for k in np.unique(level[narrow]):
-        here = level == k
-        cells = points[here].cells(2**k)
-        grid = Grid(cells.shape)
-        covered = cells.sums(np.minimum(points.area[here] / 4**k, 1))
-        around = grid.array(grid.spread_max(grid.flat(covered))).ravel()[cells.number]
-        narrow[here] &= around < COVERED
-    points = points[narrow]
-    return points[_dark_around(view, points) < COVERED] if len(points.x) else points
-
-
-def _dark_around(view: View, points: Points) -> Column:
-    """Share of lines of sight through the middle of the pupil, on a ring around each point, that end on dark bodies."""
-    unit = np.maximum(points.blur, 1)
-    x, y, radius = (from_numpy(mi.Float, column) for column in (points.x, points.y, unit))
-    dark = dr.zeros(mi.Float, len(unit))
+    cells = np.stack([np.floor(of / (CELL * 2 ** points.level())) for of in (points.x, points.y)] + [points.level()])
+    _, first, number = np.unique(cells, axis=1, return_index=True, return_inverse=True)
+    x, y, radius = (from_numpy(mi.Float, of[first]) for of in (points.x, points.y, RING_RADIUS * unit))
+    most, around = dr.opaque(mi.Float, radiance), dr.zeros(mi.Float, len(first))
     for k in range(RING):
         sine, cosine = dr.sincos(dr.opaque(mi.Float, 2 * math.pi * k / RING))
-        sight = view.integrand(mi.Point2f(x + radius * cosine, y + radius * sine), mi.Point2f(0))
-        dark += dr.select(dr.isfinite(sight.depth) & (sight.radiance <= 0), mi.Float(1), 0)
-        dr.eval(dark)
-    return dark.numpy().astype(np.float64) / RING
+        around += _ends_on_dark(view, x + radius * cosine, y + radius * sine, most)
+        dr.eval(around)
+    narrow = around.numpy() < RING_COVERED * RING
+    if straight:
+        narrow &= _ends_on_dark(view, x, y, most).numpy() > 0
+    return points[narrow[number.ravel()]]
 
 
-def shade(points: Points | None, window: Window) -> PixelArray:
-    """Largest share (h, w) of the lines of sight of each pixel that narrow bodies block, to a factor of two."""
-    share = np.zeros(window.shape)
+def _ends_on_dark(view: View, x: mi.Float, y: mi.Float, radiance: mi.Float) -> mi.Float:
+    """1 where a line of sight from a place on the film [pixels] through the middle of the pupil ends on a body of no
+    more than this radiance [W/mm²/sr], else 0."""
+    sight = view.integrand(mi.Point2f(x, y), mi.Point2f(0))
+    return dr.select(dr.isfinite(sight.depth) & (sight.radiance <= radiance), mi.Float(1), 0)
+
+
+def shade(points: Points | None, window: Window) -> tuple[PixelArray, PixelArray]:
+    """Largest share (h, w) of the lines of sight of each pixel that narrow bodies block, and the light of these bodies
+    there [W/mm²/sr], to a factor of two."""
+    share, own = (np.zeros(window.shape) for _ in range(2))
     if points is None or not math.prod(window.shape):
-        return share
+        return share, own
     points = points.seen_in(window)
-    sharp = points.blur < SHARP
-    share += maximum_filter(points[sharp].on_pixels(points[sharp].area, window.shape), 3)
-    blurred = points[~sharp]
-    covered, level = blurred.light(), blurred.level()
+    sharp, blurred = points[points.blur < SHARP], points[points.blur >= SHARP]
+    for image, light in ((share, sharp.area), (own, sharp.area * sharp.radiance)):
+        image += maximum_filter(sharp.on_pixels(light, window.shape), 3)
+    covered, level = replace(blurred, radiance=np.ones_like(blurred.radiance)).light(), blurred.level()
     for k in np.unique(level):
         here = level == k
-        reach = max(math.ceil(blurred.blur[here].max()), 1)
-        share += spread(covered[here], blurred[here], reach, window.shape)
-    return share.clip(max=1)
+        reach, some = max(math.ceil(blurred.blur[here].max()), 1), blurred[here]
+        share += spread(covered[here], some, reach, window.shape)
+        own += spread(covered[here] * some.radiance, some, reach, window.shape)
+    return share.clip(max=1), own
