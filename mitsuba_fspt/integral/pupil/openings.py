@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ...camera.camera import Camera
 from ...camera.window import Window
 from ...emission.elements import elements_of
+from ...jit.batches import batch_slices
 from ...jit.from_numpy import from_numpy
 from ...jit.mesh_buffers import triangles
 from ..lines.eq9 import View
@@ -97,25 +98,26 @@ def _near(centre: Array, blur: Array, window: Window) -> NDArray[np.bool_]:
 def _change(view: View, camera: Camera, ends: Array, share: Array, lines: _Lines) -> Array:
     """Largest change of the radiance on film across each border, as a `camera` sees it straight on, at a share of its
     length [W/mm²/sr]."""
-    points = [mi.Point3f(*(from_numpy(mi.Float, column) for column in at.T)) for at in ends.swapaxes(0, 1)]
-    along, least = from_numpy(mi.Float, share), ROUNDED * float(camera.rounding)
-    most = dr.zeros(mi.Float, len(share))
-    for node in lines.pupil:
-        pupil = mi.Point2f(*(dr.opaque(mi.Float, x) for x in node))
-        first, last = (camera.arrival(point, pupil)[0] for point in points)
-        middle = camera.arrival(dr.lerp(points[0], points[1], along), pupil)[0]
+    nodes, steps = len(lines.pupil), len(lines.aside)
+    least = ROUNDED * float(camera.rounding)
+    u, v = (from_numpy(mi.Float, np.repeat(of, steps)) for of in np.transpose(lines.pupil))
+    aside = [math.copysign(max(abs(step), least), step) for step in lines.aside]
+    across = from_numpy(mi.Float, np.tile(np.array(aside), nodes))
+    several, change = dr.opaque(mi.UInt32, nodes * steps), np.zeros(len(share))
+    for some in batch_slices(np.full(len(share), nodes * steps)):
+        points = [mi.Point3f(*(from_numpy(mi.Float, of) for of in at.T)) for at in ends[some].swapaxes(0, 1)]
+        along = from_numpy(mi.Float, share[some])
+        lane = dr.arange(mi.UInt32, len(share[some]) * nodes * steps)
+        point, line = lane // several, lane % several
+        start, end = (dr.gather(mi.Point3f, at, point) for at in points)
+        pupil = mi.Point2f(dr.gather(mi.Float, u, line), dr.gather(mi.Float, v, line))
+        first, last = (camera.arrival(at, pupil)[0] for at in (start, end))
+        middle = camera.arrival(dr.lerp(start, end, dr.gather(mi.Float, along, point)), pupil)[0]
         way = last - first
-        across = mi.Point2f(-way.y, way.x) / dr.maximum(dr.norm(way), SHORTEST)
-        high, low = dr.zeros(mi.Float, len(share)), dr.full(mi.Float, dr.inf, len(share))
-        dr.eval(middle, across)
-        for aside in lines.aside:
-            place = middle + dr.opaque(mi.Float, math.copysign(max(abs(aside), least), aside)) * across
-            light = view.integrand(place, pupil).integrand
-            high, low = dr.maximum(high, light), dr.minimum(low, light)
-            dr.eval(high, low)
-        most = dr.maximum(most, high - low)
-        dr.eval(most)
-    return np.nan_to_num(most.numpy().astype(np.float64))
+        normal = mi.Point2f(-way.y, way.x) / dr.maximum(dr.norm(way), SHORTEST)
+        light = view.integrand(middle + dr.gather(mi.Float, across, line) * normal, pupil).integrand.numpy()
+        change[some] = np.ptp(np.nan_to_num(light.astype(np.float64)).reshape(-1, nodes, steps), axis=2).max(axis=1)
+    return change
 
 
 def _borders(shapes: Sequence[mi.Shape], camera: Camera, window: Window) -> Array:

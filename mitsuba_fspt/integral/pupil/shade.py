@@ -32,6 +32,7 @@ PLACEABLE = ("Sphere", "Cylinder", "Disk", "BSplineCurve")
 # Lines of sight on a ring around a point, its radius [pixels, blur radii where these are larger], and the share of them
 # that end on the body: a quarter on a wire, a third or more on the outline of a body as wide as the ring.
 RING, RING_RADIUS, RING_COVERED = 8, 0.3, 0.3
+WIDE_BALL = 4.0  # least width of the box of a ball without narrow parts [pixels, and blur radii]
 CELL = 0.25  # side of the cells of whose points one is examined for all, likewise
 ROUNDING = 1e-3  # of a radiance
 SHARP = 0.5  # blur radius [pixels] below which a point shades its own pixel and those beside it
@@ -49,14 +50,14 @@ def narrow_bodies(view: View, window: Window, pose: Camera | None = None) -> Poi
     pose : of the camera, from which it sees them straight on by specular surfaces; None: the view's, and points that
         other bodies hide from the middle of the pupil are left out
     """
-    found, surfaces = [], surfaces_of(view.scene)
-    dark = [_points(view, pose, shape) for shape in view.scene.shapes() if only_hides(shape) and placeable(shape)]
-    if dark:
+    found, surfaces, camera = [], surfaces_of(view.scene), pose or view.camera
+    shapes = [shape for shape in view.scene.shapes() if only_hides(shape) and _may_be_narrow(shape, camera)]
+    if dark := [_points(shape, camera) for shape in shapes]:
         found.append(_narrow(view, window, Points.joined(dark), 0.0, pose is None))
     most = max((surface.brightest for surface in surfaces), default=0.0)
     for surface in surfaces:
-        if 0 < surface.brightest < most and placeable(surface.shape):
-            dim = _points(view, pose, surface.shape, surface)
+        if 0 < surface.brightest < most and _may_be_narrow(surface.shape, camera):
+            dim = _points(surface.shape, camera, surface)
             brightest = (1 + ROUNDING) * float(dim.radiance.max(initial=0.0))
             found.append(_narrow(view, window, dim, brightest, pose is None))
     points = Points.joined(found) if found else None
@@ -68,13 +69,24 @@ def placeable(shape: mi.Shape) -> bool:
     return shape.is_mesh() or shape.class_name() in PLACEABLE
 
 
-def _points(view: View, pose: Camera | None, shape: mi.Shape, surface: EmittingSurface | None = None) -> Points:
+def _may_be_narrow(shape: mi.Shape, camera: Camera) -> bool:
+    """False for a shape on which no points can be placed, and for a sphere whose image measures several pixels, and
+    blur radii."""
+    if not placeable(shape) or shape.class_name() != "Sphere":
+        return placeable(shape)
+    box = shape.bbox()
+    corners = np.array([[(box.min, box.max)[k >> n & 1][n] for n in range(3)] for k in range(8)], np.float64)
+    centre, blur = camera.film_discs(corners)
+    return not np.ptp(centre, axis=0).min() > WIDE_BALL * max(float(blur.max()), 1.0)
+
+
+def _points(shape: mi.Shape, camera: Camera, surface: EmittingSurface | None = None) -> Points:
     """Points all over both sides of a shape, with the radiance of its `surface` if it glows."""
 
     def radiance(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
         return scalar(surface.radiance(si, to_lens, mi.Bool(True))) if surface else dr.zeros(mi.Float, dr.width(si.p))
 
-    points = points_of(elements_of(shape, 1 if shape.is_mesh() else FEWEST_ELEMENTS), pose or view.camera, radiance)
+    points = points_of(elements_of(shape, 1 if shape.is_mesh() else FEWEST_ELEMENTS), camera, radiance)
     towards = points.front * np.sign(points.cosine) > 0  # the middle of the pupil lies on the side of the whole pupil
     return replace(points, cosine=np.abs(points.cosine))[towards & (points.apart < 1) & (points.area > 0)]
 
@@ -92,23 +104,23 @@ def _narrow(view: View, window: Window, points: Points, radiance: float, straigh
         return points
     cells = np.stack([np.floor(of / (CELL * 2 ** points.level())) for of in (points.x, points.y)] + [points.level()])
     _, first, number = np.unique(cells, axis=1, return_index=True, return_inverse=True)
-    x, y, radius = (from_numpy(mi.Float, of[first]) for of in (points.x, points.y, RING_RADIUS * unit))
-    most, around = dr.opaque(mi.Float, radiance), dr.zeros(mi.Float, len(first))
-    for k in range(RING):
-        sine, cosine = dr.sincos(dr.opaque(mi.Float, 2 * math.pi * k / RING))
-        around += _ends_on_dark(view, x + radius * cosine, y + radius * sine, most)
-        dr.eval(around)
-    narrow = around.numpy() < RING_COVERED * RING
+    x, y, radius = (of[first] for of in (points.x, points.y, RING_RADIUS * unit))
+    angle = 2 * math.pi * np.arange(RING)[:, None] / RING
+    ring = (np.concatenate([of[None], of + radius * turn(angle)]) for of, turn in ((x, np.cos), (y, np.sin)))
+    dark = _end_on_dark(view, *ring, radiance)
+    narrow = dark[1:].sum(axis=0) < RING_COVERED * RING
     if straight:
-        narrow &= _ends_on_dark(view, x, y, most).numpy() > 0
+        narrow &= dark[0]
     return points[narrow[number.ravel()]]
 
 
-def _ends_on_dark(view: View, x: mi.Float, y: mi.Float, radiance: mi.Float) -> mi.Float:
-    """1 where a line of sight from a place on the film [pixels] through the middle of the pupil ends on a body of no
-    more than this radiance [W/mm²/sr], else 0."""
-    sight = view.integrand(mi.Point2f(x, y), mi.Point2f(0))
-    return dr.select(dr.isfinite(sight.depth) & (sight.radiance <= radiance), mi.Float(1), 0)
+def _end_on_dark(view: View, x: Column, y: Column, radiance: float) -> Mask:
+    """True where lines of sight from places on the film [pixels] through the middle of the pupil end on a body of no
+    more than this radiance [W/mm²/sr]."""
+    place = mi.Point2f(from_numpy(mi.Float, x), from_numpy(mi.Float, y))
+    sight = view.integrand(place, mi.Point2f(0))
+    dark = dr.isfinite(sight.depth) & (sight.radiance <= dr.opaque(mi.Float, radiance))
+    return np.asarray(dark.numpy()).reshape(x.shape)
 
 
 def shade(points: Points | None, window: Window) -> tuple[PixelArray, PixelArray]:
