@@ -280,11 +280,12 @@ class Solver:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
         # Light that is narrow for a pixel is narrow for a block, too.
         largest = blocks[0]
-        narrow = self._unseen_on(replace(view, camera=largest.camera), largest.window).straight
+        unseen = self._unseen_on(replace(view, camera=largest.camera), largest.window)
+        narrow = unseen.straight
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
         edge_on = partial(self._light_edge_on, view)
-        return interpolated.solve(view, blocks, quadrature, edge_on, least_peak, progress)
+        return interpolated.solve(view, blocks, quadrature, edge_on, unseen.dark, least_peak, progress)
 
 
 def _seen_state(view: View, window: Window) -> tuple[object, ...]:

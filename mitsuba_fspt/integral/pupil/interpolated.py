@@ -107,14 +107,16 @@ def solve(
     blocks: tuple[Blocks, ...],
     quadrature: Quadrature,
     edge_on: Callable[[Window], Plane],
+    dark: DarkBodies,
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
     """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels.
 
     edge_on : gives `NarrowLight.edge_on` on the pixels of a window
+    dark : bodies on the largest blocks
     """
-    image = _BlockImage(view, blocks, quadrature, edge_on, least_peak)
+    image = _BlockImage(view, blocks, quadrature, edge_on, dark, least_peak)
     while image.own.any():
         image.compute(progress)
         if image.blocks.side == 1:
@@ -133,6 +135,7 @@ class _BlockImage:
 
     blocks, own : the present size; True where blocks are computed, False where larger ones gave their value
     edge : True for blocks on which the image may jump
+    dark : dark bodies on the largest blocks
     narrow : True for blocks on which dark bodies, or openings between them, are narrow for a block
     blur : least blur radius of an edge on a block or a neighbour [pixels]
     draft, refined : image of the present blocks in the pupil form; True where transects were taken
@@ -148,9 +151,10 @@ class _BlockImage:
         sizes: tuple[Blocks, ...],
         quadrature: Quadrature,
         edge_on: Callable[[Window], Plane],
+        dark: DarkBodies,
         least_peak: float,
     ) -> None:
-        self.edge_on_pixels = edge_on
+        self.edge_on_pixels, self.dark = edge_on, dark
         self.view, self.sizes, self.quadrature, self.peak = view, sizes, quadrature, least_peak
         self.blocks, shape = sizes[0], sizes[0].window.shape
         self.grid, self.own = Grid(shape), np.ones(shape, bool)
@@ -164,7 +168,8 @@ class _BlockImage:
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.computed, draft.given = grid.flat(self.own), grid.flat(self.value)
-        draft.set_dark(DarkBodies.seen(draft.view, blocks.window))
+        first = blocks is self.sizes[0]
+        draft.set_dark(self.dark if first else DarkBodies.seen(draft.view, blocks.window))
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
             blur, self.refined = _refine_blurred(draft)

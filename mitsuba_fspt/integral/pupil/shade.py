@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from ...camera.camera import Camera
-from ...camera.window import Window
+from ...camera.window import Window, corners_of
 from ...emission.elements import elements_of
 from ...emission.emitting_surface import EmittingSurface
 from ...emission.of_emitter import surfaces_of
+from ...jit.batches import batch_slices
 from ...jit.from_numpy import from_numpy
 from ...jit.spectra import scalar
 from ..lines.eq9 import View
@@ -75,8 +76,7 @@ def _may_be_narrow(shape: mi.Shape, camera: Camera) -> bool:
     if not placeable(shape) or shape.class_name() != "Sphere":
         return placeable(shape)
     box = shape.bbox()
-    corners = np.array([[(box.min, box.max)[k >> n & 1][n] for n in range(3)] for k in range(8)], np.float64)
-    centre, blur = camera.film_discs(corners)
+    centre, blur = camera.film_discs(corners_of([(*box.min, *box.max)]))
     return not np.ptp(centre, axis=0).min() > WIDE_BALL * max(float(blur.max()), 1.0)
 
 
@@ -115,12 +115,14 @@ def _narrow(view: View, window: Window, points: Points, radiance: float, straigh
 
 
 def _end_on_dark(view: View, x: Column, y: Column, radiance: float) -> Mask:
-    """True where lines of sight from places on the film [pixels] through the middle of the pupil end on a body of no
-    more than this radiance [W/mm²/sr]."""
-    place = mi.Point2f(from_numpy(mi.Float, x), from_numpy(mi.Float, y))
-    sight = view.integrand(place, mi.Point2f(0))
-    dark = dr.isfinite(sight.depth) & (sight.radiance <= dr.opaque(mi.Float, radiance))
-    return np.asarray(dark.numpy()).reshape(x.shape)
+    """True where lines of sight from places (lines, cells) on the film [pixels] through the middle of the pupil end on
+    a body of no more than this radiance [W/mm²/sr]."""
+    most, dark = dr.opaque(mi.Float, radiance), np.zeros(x.shape, bool)
+    for some in batch_slices(np.full(x.shape[1], len(x))):
+        place = mi.Point2f(*(from_numpy(mi.Float, of[:, some]) for of in (x, y)))
+        sight = view.integrand(place, mi.Point2f(0))
+        dark[:, some] = (dr.isfinite(sight.depth) & (sight.radiance <= most)).numpy().reshape(len(x), -1)
+    return dark
 
 
 def shade(points: Points | None, window: Window) -> tuple[PixelArray, PixelArray]:
