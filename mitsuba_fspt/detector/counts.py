@@ -42,6 +42,7 @@ BRIGHT = 99.9  # percentile at which the pixels of a frame are cut off for its m
 DN = ("", "dn", "adu", "count", "counts", "ct")  # names of it in BUNIT
 WRAPPED = -(2**14)  # DN of 16 bits with a sign: lower ones are no dark counts, but wrapped ones of 32768 … 49151
 EMPTY = -(2**15)  # least number of 16 bits with a sign, by which programs mark pixels without a value
+SAME_GAIN = 0.1  # relative difference of a gain by measurement from that of a data sheet
 SAME_TIME = 0.01  # relative difference of exposure times that rounding in headers may cause
 # Of a file's `top_row`: the keyword or tag, and words on files without it, and on those whose rows were turned by it.
 SILENT: dict[str | None, tuple[str, str]] = {
@@ -76,6 +77,7 @@ class Counts:
     raw : True for unsigned integers, as a camera delivers them; False for floats and integers with a sign
     bias, background : frames (h, w) [DN] of a click folder, or None
     exposure_time : [s], None if the file does not state it
+    gain : [e-/DN], None if the file does not state it
     binning : side of the square of pixels read out as one, None if the file does not state it
     pixel_pitch : of the pixels read out [mm], None if the file does not state it
     pixel_sides : their width and height [mm], if the file states that they are not square; else None
@@ -99,6 +101,7 @@ class Counts:
     top_row: str | None = FIRST
     unit: str | None = None
     pixel_sides: tuple[float, float] | None = None
+    gain: float | None = None
 
 
 def frame_of(given: Frame | Counts, name: str, frames: int | None = None) -> Counts:
@@ -120,10 +123,12 @@ def frame_like(given: Frame | Counts, name: str, shape: tuple[int, ...]) -> Coun
     return found
 
 
-def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float | None, own: float | None) -> None:
+def tell_stated(
+    counts: Counts, time: float, gain: float | None, binning: int | None, pitch: float | None, own: float | None
+) -> None:
     """Say in one line each on stderr what the file of the counts states otherwise than the numbers that are used.
 
-    time : exposure time [s];  binning : None for 1, which nothing states
+    time : exposure time [s];  gain : [e-/DN], None where it does not count;  binning : None for 1, which nothing states
     pitch, own : of the pixels read out and of the detector's own pixels [mm], or None
 
     Raises ImageError where only the file states the sides of the pixels, and they are not square.
@@ -131,6 +136,7 @@ def tell_stated(counts: Counts, time: float, binning: int | None, pitch: float |
     side = own * (binning or 1) if pitch is None and own is not None else pitch
     for name, used, stated, unit, same in (
         ("exposure_time", time, counts.exposure_time, " s", SAME_TIME),
+        ("gain", gain, counts.gain, " e-/DN", SAME_GAIN),
         ("binning", binning, counts.binning, "", 0.0),
         ("pixel_pitch", side, counts.pixel_pitch, " mm", SAME_PITCH),
     ):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,9 +15,14 @@ from numpy.typing import NDArray
 
 from ..images.formats import Metadata
 from ..images.noise_model import digest_of, frame_recorded
+from ..runtime.errors import DetectorError
+from ..runtime.numbers import number
+from .counts import Counts, Frame, frame_like, require_same_rows, require_same_time
+from .parameters import DetectorParameters
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
+DARKEST = 1.0  # percent of the pixels, which have no light or less than others
 SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
 
 
@@ -46,6 +54,76 @@ class Background:
             return {}
         common = frames * np.asarray(self.added)  # of one frame of the sum, as `independent` is
         return frame_recorded(digest_of([self.frame], metadata), common * frames, (independent + common) * frames)
+
+
+def background_of(
+    detector: DetectorParameters,
+    raw: Counts,
+    dark_charge: Array | float,
+    spurious: float,
+    exposure_time: float,
+    bias: Frame | None,
+    dark: Frame | float | None,
+) -> Background:
+    """What the counts have without light, by the numbers of the detector or by frames without light.
+
+    A dark frame, or a number in its place, has the same exposure time as the counts and contains the bias. Both frames
+    contain the spurious charge. What a dark frame shows above the bias counts as charge, see `shown_charge`.
+
+    dark_charge, spurious : charges by the numbers of the detector, before the register [e-]
+    exposure_time : [s]
+    """
+    shape = raw.values.shape
+    gain = detector.on_pixels("gain", shape) / detector.em_gain  # electrons before the register per DN
+    charge = dark_charge + spurious
+    reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
+    given = raw.bias if bias is None else bias
+    empty = None if given is None else frame_like(given, "bias", shape)  # without dark charge
+    zero = own = detector.on_pixels("bias", shape)
+    tell = partial(tell_below_bias, raw.values, own, float(np.median(np.sqrt(reading) / gain)))
+    noise: Array | float = 0.0  # variance of the bias frame
+    if empty is not None:
+        require_same_rows("bias", empty.top_row, "counts", raw.top_row)
+        tell("bias", empty.values)
+        zero, noise = empty.values - spurious / gain, (detector.excess * spurious + reading) / empty.frames
+    if dark is not None and not isinstance(dark, (str, os.PathLike)) and np.ndim(dark) == 0:
+        level = number("reduce: 'dark'", dark, DetectorError, "500")
+        if not 0 <= level < np.inf:
+            raise DetectorError(f"reduce: 'dark' must be >= 0 DN, got {level:g}. Give the bias and the dark current.")
+        tell("dark", level)
+        shown = gain * (level - zero)
+        return Background(level, shown_charge(shown, charge, reading, detector.excess, math.inf, noise))
+    frame = raw.background if dark is None and raw.background is not None else dark
+    if frame is not None:
+        found = frame_like(frame, "dark", shape)
+        require_same_rows("dark", found.top_row, "counts", raw.top_row)
+        require_same_time("dark", found, "counts", exposure_time)
+        tell("dark", found.values)
+        shown = gain * (found.values - zero)
+        charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)
+        return Background(found.values, charge, (detector.excess * charge + reading) / found.frames, found.values)
+    if empty is not None:
+        return Background(empty.values + dark_charge / gain, charge, noise, empty.values)
+    return Background(own + charge / gain, charge)
+
+
+def tell_below_bias(counts: Array, bias: Array | float, noise: float, name: str, level: Array | float) -> None:
+    """Say in one line on stderr that a frame without light is darker than the bias of the detector, and the counts are
+    not: the bias has been subtracted from the frame, as from darks that were reduced before, but not from the counts.
+
+    counts : (h, w) [DN];  bias : of the detector [DN];  noise : of reading a pixel [DN]
+    name : of the frame;  level : of its pixels [DN]
+    """
+    below = float(np.median(bias - level))
+    if below > SURE * noise and float(np.percentile(counts - level, DARKEST)) > below / 2:
+        LOG.warning(
+            "fspt: reduce: '%s' is %.3g DN below the bias of the detector, %.4g DN, which counts have without light. "
+            "If the bias was subtracted from it before, the image is too bright by that. Give frames as they are read "
+            "out, or correct 'bias'.",
+            name,
+            below,
+            float(np.median(bias)),
+        )
 
 
 def shown_charge(

@@ -26,6 +26,7 @@ from ..rendering.lens_numbers import lens_numbers
 from ..runtime.errors import DetectorError
 from ..runtime.numbers import number
 from .counts import Counts, Frame, frame_like, require_same_rows, require_same_time
+from .dark_charge import tell_below_bias
 from .parameters import DetectorParameters
 from .saturation import full_pixels
 from .stray_light import Spread
@@ -225,6 +226,9 @@ def _background(
         frame = frame_like(flat_dark, "flat_dark", shape)
         require_same_rows("flat_dark", frame.top_row, "flat", flat.top_row)
         require_same_time("flat_dark", frame, "flat", flat.exposure_time)
+        if flat.raw:
+            noise = detector.mean("read_noise") / detector.mean("gain")
+            tell_below_bias(flat.values, detector.on_pixels("bias", shape), noise, "flat_dark", frame.values)
         return frame.values, frame.frames
     if flat.raw:
         given = f"{float(bias):g} DN" if np.ndim(bias) == 0 else "frame"

@@ -41,11 +41,10 @@ from .counts import (
     frame_like,
     frame_of,
     require_same_rows,
-    require_same_time,
     tell_stated,
     tell_unequal_frames,
 )
-from .dark_charge import Background, shown_charge
+from .dark_charge import background_of
 from .flat_field import PRNU, FlatField, flat_field, require_no_flat, require_rows_of_maps, tell_loss
 from .parameters import MAPPED, RECORDED, DetectorParameters, Own
 from .read_out import pixels_read_out
@@ -226,13 +225,15 @@ def reduce_counts(
     if pitch is None and detector.pixel_pitch is None:
         pitch = raw.pixel_pitch
     binning, pitch, metadata = pixels_read_out(metadata or {}, binning, pitch, detector.pixel_pitch)
-    tell_stated(raw, exposed.exposure_time, binning, pitch, detector.pixel_pitch)
+    gain = detector.mean("gain") if detector.em_gain == 1 else None  # programs count the register's in or not
+    tell_stated(raw, exposed.exposure_time, gain, binning, pitch, detector.pixel_pitch)
     exposed = replace(exposed, binning=binning or 1, pixel_pitch=pitch)
     require_rows_of_maps(detector, "counts", raw, unused=() if corrections.flat is None else PRNU)
     shape = raw.values.shape
     full = full_pixels(detector, raw, "counts")
     rays = _cosmic_rays(detector, raw.values, full) if corrections.cosmic_rays else np.zeros(shape, bool)
-    dark = _background(detector, raw, exposed, corrections.bias, corrections.dark)
+    charges = exposed.dark(detector, shape), exposed.spurious(detector)
+    dark = background_of(detector, raw, *charges, exposed.exposure_time, corrections.bias, corrections.dark)
     flat = corrections.flat_field(detector, raw, exposed)
     gain = detector.on_pixels("gain", shape) / detector.em_gain
     electrons = _corrected(raw.values, dark.level, flat) * gain
@@ -336,46 +337,6 @@ def calibrated(detector: Own, image: Image, power: Array, error: float) -> Own:
     if image.error is not None:
         noise = float(np.sqrt((image.error[good].astype(np.float64) ** 2).sum()) / image.power[good].sum())
     return replace(detector, quantum_efficiency=efficiency, gain_error=float(np.hypot(error, noise)))
-
-
-def _background(
-    detector: DetectorParameters, raw: Counts, exposed: Exposed, bias: Frame | None, dark: Frame | float | None
-) -> Background:
-    """What the counts have without light.
-
-    A dark frame, or a number in its place, has the same exposure time as the counts and contains the bias. Both frames
-    contain the spurious charge. What a dark frame shows above the bias counts as charge, see `shown_charge`.
-    """
-    shape = raw.values.shape
-    gain = detector.on_pixels("gain", shape) / detector.em_gain  # electrons before the register per DN
-    dark_charge, spurious = exposed.dark(detector, shape), exposed.spurious(detector)
-    charge = dark_charge + spurious
-    reading = (detector.on_pixels("read_noise", shape) / detector.em_gain) ** 2 + gain**2 / 12
-    given = raw.bias if bias is None else bias
-    empty = None if given is None else frame_like(given, "bias", shape)  # without dark charge
-    if empty is not None:
-        require_same_rows("bias", empty.top_row, "counts", raw.top_row)
-    zero = detector.on_pixels("bias", shape)
-    noise: Array | float = 0.0  # variance of the bias frame
-    if empty is not None:
-        zero, noise = empty.values - spurious / gain, (detector.excess * spurious + reading) / empty.frames
-    if dark is not None and not isinstance(dark, (str, os.PathLike)) and np.ndim(dark) == 0:
-        level = number("reduce: 'dark'", dark, DetectorError, "500")
-        if not 0 <= level < np.inf:
-            raise DetectorError(f"reduce: 'dark' must be >= 0 DN, got {level:g}. Give the bias and the dark current.")
-        shown = gain * (level - zero)
-        return Background(level, shown_charge(shown, charge, reading, detector.excess, math.inf, noise))
-    frame = raw.background if dark is None and raw.background is not None else dark
-    if frame is not None:
-        found = frame_like(frame, "dark", shape)
-        require_same_rows("dark", found.top_row, "counts", raw.top_row)
-        require_same_time("dark", found, "counts", exposed.exposure_time)
-        shown = gain * (found.values - zero)
-        charge = shown_charge(shown, charge, reading, detector.excess, found.frames, noise)
-        return Background(found.values, charge, (detector.excess * charge + reading) / found.frames, found.values)
-    if empty is not None:
-        return Background(empty.values + dark_charge / gain, charge, noise, empty.values)
-    return Background(detector.on_pixels("bias", shape) + charge / gain, charge)
 
 
 def _corrected(values: Array, level: Array | float, flat: FlatField | None) -> Array:

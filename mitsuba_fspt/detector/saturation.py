@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,10 @@ LOG = logging.getLogger("mitsuba_fspt")
 CHANCE = 1e-6  # of a false alarm in an image whose noise is that of the detector's numbers
 WHOLE = 1e-3  # deviation of a sum of frames from a whole number that rounding may cause
 MANY = 5  # pixels: fewer at the largest count are passed over
+FEWEST_BITS = 8  # of a converter
+# Second differences over their standard deviation: the least median that noise makes, and the largest that is no edge;
+# number of them that tells.
+NOISY, EDGE, ENOUGH = 0.3, 5.0, 100
 WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
 
 
@@ -65,18 +70,25 @@ def unknown_ceiling(detector: DetectorParameters, counts: Array, frames: int = 1
     the value M in the tail from M on of a normal distribution with the standard deviation σ of shot and read noise at
     M: h = 1 − Q(z + s/σ)/Q(z), Q(z) = n/N, with all N pixels and the step s of the counts. Fewer pixels of that light
     lie less far in the tail, where h is smaller. At low light σ is below the step, h is near 1 and nothing is found.
-    Counts without noise, such as simulated ones, repeat other values as often; then nothing is found either.
+    Counts without noise, such as simulated ones, repeat other values as often; then nothing is found either. Areas that
+    were set to one value, or columns without response, repeat it too: neighbours elsewhere tell whether there is noise.
+    Where all counts are equal, they are at the ceiling if they are the largest count of a converter with fewer bits.
 
     counts : (h, w) [DN], of one frame or the mean of `frames` frames
     """
     values, numbers = np.unique(counts, return_counts=True)
     reached = int(numbers[-1])
-    if reached < MANY or len(values) == 1:
+    if reached < MANY:
         return None
+    if len(values) == 1:
+        return float(values[0]) if values[0] + 1 in 2.0 ** np.arange(FEWEST_BITS, detector.bits) else None
     step = _step(values, frames)
     depth = norm.isf(reached / counts.size)
     share = 1 - norm.sf(depth + step / _sigma(detector, values[-1], frames)) / norm.sf(depth)
-    if reached * np.log(share) > np.log(CHANCE) or _without_noise(detector, values[:-1], numbers[:-1], step, frames):
+    if reached * np.log(share) > np.log(CHANCE):
+        return None
+    noisy = _neighbours_differ(detector, counts, frames)
+    if not noisy and _without_noise(detector, values[:-1], numbers[:-1], step, frames):
         return None
     return float(values[-1])
 
@@ -90,6 +102,21 @@ def _step(values: Array, frames: int) -> float:
     if np.abs(whole - values * frames).max() > WHOLE:
         return float(np.diff(values).min())
     return float(np.gcd.reduce(np.diff(whole).astype(np.int64))) / frames
+
+
+def _neighbours_differ(detector: DetectorParameters, counts: Array, frames: int) -> bool:
+    """True if second differences d along rows of counts (h, w) [DN] are as large as noise makes them.
+
+    The median of |d|/(√6 σ) is 0.67 by normal noise, and 0 of smooth counts without noise. Three equal counts in a row,
+    counts at the ceiling and edges in the image are left out.
+    """
+    if counts.ndim != 2 or counts.shape[1] < 3:
+        return False
+    left, middle, right = counts[:, :-2], counts[:, 1:-1], counts[:, 2:]
+    ratio = np.abs(left - 2 * middle + right) / (math.sqrt(6) * _sigma(detector, middle, frames))
+    used = ((left != middle) | (middle != right)) & (np.maximum(np.maximum(left, middle), right) < counts.max())
+    used &= ratio < EDGE
+    return bool(used.sum() >= ENOUGH and np.median(ratio[used]) > NOISY)
 
 
 def _without_noise(
@@ -107,9 +134,9 @@ def _without_noise(
     return bool(numbers[most] > 1 and len(values) * poisson.sf(numbers[most] - 1, inside * share) < CHANCE)
 
 
-def _sigma(detector: DetectorParameters, counts: float, frames: int) -> float:
+def _sigma(detector: DetectorParameters, counts: Array | float, frames: int) -> Array:
     """Standard deviation [DN] of shot, read and rounding noise of the mean of `frames` frames at these counts [DN]."""
     gain, read = detector.mean("gain"), detector.mean("read_noise")
-    electrons = max(gain * (counts - detector.mean("bias")), 0.0)
+    electrons = np.maximum(gain * (counts - detector.mean("bias")), 0.0)
     variance = (detector.em_gain * detector.excess * electrons + read**2) / gain**2 + 1 / 12
-    return float(np.sqrt(variance / frames))
+    return np.asarray(np.sqrt(variance / frames))

@@ -25,6 +25,7 @@ NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     **dict.fromkeys(("EXPTIME", "EXPOSURE"), ("number >= 0 of seconds", lambda v: v >= 0)),
     **dict.fromkeys(("XBINNING", "YBINNING"), ("whole number >= 1", lambda v: v >= 1 and v == int(v))),
     **dict.fromkeys(("XPIXSZ", "YPIXSZ"), ("number > 0 of um", lambda v: v > 0)),
+    "EGAIN": ("number > 0 of electrons per DN", lambda v: v > 0),
 }
 KEYWORDS = (*NUMBERS, ROW_ORDER, UNIT)
 SAME_PITCH = 1e-3  # relative difference of pixel pitches that rounding in files may cause
@@ -34,9 +35,10 @@ FIRST, LAST, TURNED, UNTAGGED = "first", "last", "turned", "untagged"  # which r
 def read_frame(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Array of a .tif, .fits or .npy file as it is stored, row 0 at the top, and what a FITS header states.
 
-    The header's entries are `exposure_time` [s], `binning`, `pixel_pitch` [mm], or of pixels that are not square
-    `pixel_sides`, width and height [mm], and `unit` of the values, as far as it has them, and `top_row`, the row of the
-    file that is the top one: 'first' or 'last', None if the header does not say it. Of a TIFF it is as of `tiff_row`.
+    The header's entries are `exposure_time` [s], `gain` [e-/DN], `binning`, `pixel_pitch` [mm], or of pixels that are
+    not square `pixel_sides`, width and height [mm], and `unit` of the values, as far as it has them, and `top_row`, the
+    row of the file that is the top one: 'first' or 'last', None if the header does not say it. Of a TIFF it is as of
+    `tiff_row`.
 
     thing : what the file is, for messages, such as "counts 'a.tif'"
 
@@ -80,7 +82,8 @@ def _fits(path: Path, thing: str) -> tuple[NDArray[Any], dict[str, Any]]:
     """Data of the first image of a FITS file, of two axes or more, row 0 at the top, and what its header states; others
     are told.
 
-    EXPTIME or EXPOSURE in s, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write them.
+    EXPTIME or EXPOSURE in s, EGAIN, XBINNING, and XPIXSZ, the side of a binned pixel in µm, as imaging programs write
+    them.
     `top_row` is None where no ROWORDER says which row is the top one; the first is taken then. Pixels of integers that
     are BLANK become NaN.
     """
@@ -143,6 +146,7 @@ def _stated(header: dict[str, Any], thing: str) -> dict[str, Any]:
     found: dict[str, Any] = {"top_row": {TOP_DOWN: FIRST, BOTTOM_UP: LAST}.get(order)}
     time = numbers["EXPOSURE"] if numbers["EXPTIME"] is None else numbers["EXPTIME"]
     found |= {} if time is None else {"exposure_time": time}
+    found |= {} if numbers["EGAIN"] is None else {"gain": numbers["EGAIN"]}
     found |= {} if sides is None else {"binning": int(sides)}
     found |= {} if header[UNIT] is None else {"unit": str(header[UNIT]).strip()}
     if wide and high and abs(wide - high) > SAME_PITCH * high:

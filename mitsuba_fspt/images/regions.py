@@ -157,10 +157,11 @@ def region_mask(image: ImageData, text: str) -> Mask:
 
 
 def _mask_of_file(name: str) -> Mask:
-    """Pixels of a TIFF file that are not 0."""
+    """Pixels of a TIFF file that are neither 0 nor NaN, which stands for what is outside."""
     if not os.path.isfile(name):
         raise ImageError(f"region '{name}': there is no such file. Give a mask, or {FORMS}.")
-    return np.asarray(read_tiff(Path(name), f"region '{name}'")) != 0
+    values = np.asarray(read_tiff(Path(name), f"region '{name}'"))
+    return (values != 0) & ~np.isnan(values)
 
 
 def _check_mask(image: ImageData, mask: Mask, what: str) -> None:

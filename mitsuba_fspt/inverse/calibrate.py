@@ -35,6 +35,7 @@ from .view_factors import gain_error_of
 Array = NDArray[np.float64]
 GivenImage = Image | Exposure | str | os.PathLike[str]
 GAIN = "gain"  # reserved name: a factor on all powers
+APART = 10.0  # ratio of the powers of images and scene above which it is told that no 'gain' is fitted
 KEPT = 2**28  # bytes of renderings that are not computed again, 256 MB
 PITCH_TOLERANCE = 1e-6  # relative: of the pixel pitch, which files may hold in single precision
 
@@ -139,6 +140,7 @@ def calibrate(
         renderings = _Renderings(scene, names, views, powers, strays, sensor, settings.rtol or 1e-4, report)
         renderings(start)
         data = measured_of(found, views, renderings.first, len(names), sampled)
+        start = _with_first_gain(names, start, data, renderings.first)
         fitted = CalibrationFit(names, start, data, renderings, settings).solved()
     return _calibration(names, data, fitted, os.fspath(scene))
 
@@ -194,6 +196,27 @@ def _start(scene: str | os.PathLike[str], names: tuple[str, ...], views: Sequenc
         raise InversionError("calibrate: 'gain' is a factor on all powers, and a <default>. Rename that in the scene.")
     with renamed("derivatives", "calibrate"):
         return np.array([1.0 if name == GAIN else varied_value(xml, name) for name in names])
+
+
+def _with_first_gain(names: tuple[str, ...], start: Array, data: Measured, first: Sequence[Image]) -> Array:
+    """The start values (p,), with the `gain` by which the `first` renderings have the images' power on the pixels that
+    count; where gain is not fitted, one line on stderr tells if the two powers are far apart.
+    """
+    measured = float(data.power[data.used].sum())
+    rendered = float(np.stack([image.power for image in first])[data.used].sum())
+    if not (measured > 0 and rendered > 0):
+        return start
+    if GAIN in names:
+        return np.where([name == GAIN for name in names], measured / rendered, start)
+    if max(measured / rendered, rendered / measured) > APART:
+        told(
+            "calibrate",
+            [
+                f"the images have {measured / rendered:.3g} times the power of the scene at its own values; no pose of "
+                "the camera may give that. Free 'gain' too, or correct J_n of the scene."
+            ],
+        )
+    return start
 
 
 def _noise(images: Sequence[Image]) -> float:

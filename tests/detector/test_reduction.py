@@ -201,6 +201,24 @@ def test_a_total_below_zero_is_reported(caplog):
     assert [record.getMessage().count("standard deviations below 0") for record in caplog.records] == [1]
 
 
+@pytest.mark.parametrize("name", ["dark", "bias", "flat_dark"])
+def test_a_frame_without_the_bias_is_told(name, caplog):
+    """As other programs write darks. Seen to fail: the image is 500 DN a pixel too bright without a word.
+
+    Nothing is told of frames as they are read out, nor of counts that have lost the bias, too.
+    """
+    raw = CCD.expose(ramp(), 60, 650, seed=1).counts.astype(float)
+    frame = 500 + np.random.default_rng(2).normal(0, 2.2, raw.shape)
+    flat = {"flat": np.full(raw.shape, 20500, np.uint16), "flat_kind": "sensor", "flat_dark": 500 + 0 * frame}
+    CCD.reduce(raw, **SETTINGS, **{"dark": frame} | flat | {name: frame})
+    assert not caplog.records
+    if name != "flat_dark":
+        CCD.reduce(raw - 500, **SETTINGS, **{name: frame - 500})
+        assert not [record for record in caplog.records if "is 500 DN below" in record.getMessage()]
+    CCD.reduce(raw, **SETTINGS, **{"dark": frame} | flat | {name: frame - 500})
+    assert f"'{name}' is 500 DN below the bias of the detector, 500 DN" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("most", "times", "told"), [(0.0, (60, 60), 0), (3.0, (60,) * 40, 0), (3e4, (60, 60), 0), (300.0, (60, 120), 1)]
 )
@@ -301,13 +319,16 @@ def test_files(tmp_path):
 
 
 def test_another_exposure_time_in_the_file_is_reported(tmp_path, caplog):
-    """EXPTIME of 60 s says nothing beside 60 s, and one line beside 30 s, which are used."""
+    """EXPTIME of 60 s says nothing beside 60 s, and one line beside 30 s, which are used. So does EGAIN."""
     fits = pytest.importorskip("astropy.io.fits")
     hdu = fits.PrimaryHDU(CCD.expose(ramp(), 60, 650, seed=1).counts)
-    hdu.header.update({"EXPTIME": 60.0, "ROWORDER": "TOP-DOWN"})
+    hdu.header.update({"EXPTIME": 60.0, "ROWORDER": "TOP-DOWN", "EGAIN": 1.55})
     hdu.writeto(tmp_path / "a.fits")
     CCD.reduce(tmp_path / "a.fits", **SETTINGS)
     assert not caplog.records
+    replace(CCD, gain=0.8).reduce(tmp_path / "a.fits", **SETTINGS)
+    assert "'gain' is 0.8 e-/DN, the file of the counts states 1.55 e-/DN. The former is used" in caplog.text
+    caplog.clear()
     found = CCD.reduce(tmp_path / "a.fits", exposure_time=30, wavelength_nm=650)
     assert found.electrons_per_watt == pytest.approx(PER_WATT / 2)
     (told,) = [record.getMessage() for record in caplog.records]

@@ -9,7 +9,7 @@ import pytest
 
 import mitsuba_fspt as fspt
 from mitsuba_fspt.detector.saturation import unknown_ceiling
-from mitsuba_fspt.runtime.errors import ImageError
+from mitsuba_fspt.runtime.errors import DetectorError, ImageError
 
 CCD = fspt.Detector.typical_ccd()
 SETTINGS = {"exposure_time": 60.0, "wavelength_nm": 650.0}
@@ -73,6 +73,24 @@ def test_noise_makes_no_ceiling(shape, camera):
 def test_counts_without_noise_have_no_ceiling(counts):
     """Simulated counts repeat values anywhere."""
     assert unknown_ceiling(CCD, counts) is None
+
+
+@pytest.mark.parametrize("value", [0, 500])
+def test_areas_of_one_value_hide_no_ceiling(value):
+    """What is around the spot was cleared, or two columns have no response. Seen to fail: counts without noise."""
+    counts = np.minimum(exposed(SPOT, 8000), 4095).astype(float)
+    cleared = np.where(np.hypot(ROWS, COLUMNS) > 25, value, counts)
+    assert unknown_ceiling(CCD, cleared) == 4095
+    assert unknown_ceiling(CCD, np.where(COLUMNS < -30, value, counts)) == 4095
+
+
+def test_counts_that_are_all_at_the_ceiling(caplog):
+    """12 bits in 16, also of a flat field. Seen to be taken for a uniform image."""
+    full = np.full((64, 64), 4095, np.uint16)
+    assert unknown_ceiling(CCD, full.astype(float)) == 4095
+    assert CCD.reduce(full, **SETTINGS).masked == full.size
+    with pytest.raises(DetectorError, match="no usable pixel: 4096 are saturated"):
+        CCD.reduce(exposed(SPOT, 2000), **SETTINGS, flat=full, flat_kind="sensor", flat_dark=500)
 
 
 @pytest.mark.parametrize(("camera", "top"), list(zip(CAMERAS, (4095, 1023, 16383, 255), strict=True)))

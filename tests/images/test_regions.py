@@ -82,6 +82,9 @@ def test_a_mask_of_another_program(tmp_path):
     drawn[1, 2:] = 255
     tifffile.imwrite(tmp_path / "mask.tif", drawn)
     assert ramp.power[region_mask(ramp, str(tmp_path / "mask.tif"))].tolist() == [8, 9, 10]
+    outside = np.where(drawn > 0, 1, np.nan).astype(np.float32)  # seen to count as inside
+    tifffile.imwrite(tmp_path / "nan.tif", outside)
+    assert ramp.power[region_mask(ramp, str(tmp_path / "nan.tif"))].tolist() == [8, 9, 10]
     tifffile.imwrite(tmp_path / "small.tif", drawn[:2])
     tifffile.imwrite(tmp_path / "empty.tif", np.zeros((4, 5), np.uint8))
     (tmp_path / "text.tif").write_text("no picture")

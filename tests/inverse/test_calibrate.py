@@ -88,6 +88,22 @@ def test_a_gain_of_images_with_stray_light(scene):
     assert found.chi2 == pytest.approx(0.95**2, abs=0.4)
 
 
+def test_a_gain_far_from_one(scene, caplog):
+    """A source of 1e-11 W in a scene of 1 W: distance and gain come back. Seen not to end in 40 steps from a gain of 1.
+
+    Without a gain to fit, one line tells that the powers are far apart.
+    """
+    image = noisy(scene, 1, distance=163.5)
+    faint = fspt.Image(1e-11 * image.power, 1e-11 * image.error)
+    found = fspt.calibrate(scene, faint, free=["distance", "gain"], settings=COARSE)
+    assert abs(found.values["distance"] - 163.5) < 4 * found.sd["distance"]
+    assert abs(found.values["gain"] - 1e-11) < 4 * found.sd["gain"]
+    assert not caplog.records
+    with pytest.raises(InversionError):
+        fspt.calibrate(scene, faint, free=["distance"], settings=replace(COARSE, steps=1))
+    assert "the images have 1.02e-11 times the power of the scene" in caplog.text
+
+
 def test_a_number_of_the_distortion_comes_back(tmp_path, mono):
     """k1 as a `<default>` inside the string, of an 8 mm lens with a wide film before two spheres, within 4 sd."""
     text = '<string name="distortion" value="$k1, 0.01, 0, 0"/><transform name="to_world">'
