@@ -225,8 +225,8 @@ def reduce_counts(
     if pitch is None and detector.pixel_pitch is None:
         pitch = raw.pixel_pitch
     binning, pitch, metadata = pixels_read_out(metadata or {}, binning, pitch, detector.pixel_pitch)
-    gain = detector.mean("gain") if detector.em_gain == 1 else None  # programs count the register's in or not
-    tell_stated(raw, exposed.exposure_time, gain, binning, pitch, detector.pixel_pitch)
+    stated = detector.mean("gain") if detector.em_gain == 1 else None  # programs count the register's in or not
+    tell_stated(raw, exposed.exposure_time, stated, binning, pitch, detector.pixel_pitch)
     exposed = replace(exposed, binning=binning or 1, pixel_pitch=pitch)
     require_rows_of_maps(detector, "counts", raw, unused=() if corrections.flat is None else PRNU)
     shape = raw.values.shape
