@@ -851,6 +851,20 @@ MUTANTS = (
         ("tests/integral/test_dark_bodies.py",),
     ),
     Mutant(
+        "fine variation of J_n",
+        "integral/pupil/draft.py",
+        "dr.maximum(self.missed, self.variation)",
+        "dr.maximum(self.missed, 0 * self.variation)",
+        ("tests/integral/test_fine_variation.py",),
+    ),
+    Mutant(
+        "fine variation of J_n on blocks",
+        "integral/pupil/interpolated.py",
+        "draft.in_doubt() | draft.varied()",
+        "draft.in_doubt()",
+        ("tests/integral/test_fine_variation.py",),
+    ),
+    Mutant(
         "hidden columns of the matrix",
         "integral/rows/view_rows.py",
         "sums[~exact | (sums <= 0)]",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,7 +11,6 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera.camera import Camera
 from ..camera.window import Boxes, Window, window_of
@@ -31,7 +31,7 @@ from .progress import Progress
 from .pupil import interpolated, pupil_form
 from .pupil.dark_bodies import DarkBodies
 from .pupil.interpolated import Blocks, blocks_of
-from .pupil.narrow import NARROW, edge_on_light, peak_of_points
+from .pupil.narrow import NARROW, peak_of_points
 from .pupil.seen_points import SeenPoints, Unseen
 from .quadrature import FLOAT32_FLOOR, Quadrature
 from .shortcuts import Finding
@@ -54,7 +54,8 @@ class Solver:
     def __init__(self) -> None:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
-        self._window, self._unseen, self._edge_on = (CachedValue() for _ in range(3))
+        self._window = CachedValue()
+        self._unseen: dict[float, CachedValue] = defaultdict(CachedValue)  # of each pixel pitch, as blocks have
         self._faces, self._seen_faces, self._grid_of_blocks = (CachedValue() for _ in range(3))
 
     def solve(
@@ -151,14 +152,7 @@ class Solver:
         """Light and shade that lines of sight may miss on the pixels of a window; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
         state = _seen_state(view, window)
-        return self._unseen.recall(state, lambda: SeenPoints.of(view).unseen(window), held)
-
-    def _light_edge_on(self, view: View, window: Window) -> NDArray[np.float64]:
-        """`NarrowLight.edge_on` on the pixels of a window; cached."""
-        held = [geometry_of(shape) for shape in view.scene.shapes()]
-        return self._edge_on.recall(
-            _seen_state(view, window), lambda: edge_on_light(SeenPoints.of(view).straight, window), held
-        )
+        return self._unseen[view.camera.pixel_pitch].recall(state, lambda: SeenPoints.of(view).unseen(window), held)
 
     def _fill(
         self,
@@ -278,14 +272,16 @@ class Solver:
         self, view: View, blocks: tuple[Blocks, ...], quadrature: Quadrature, least_peak: float, progress: Progress
     ) -> Solution | None:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
+
         # Light that is narrow for a pixel is narrow for a block, too.
-        largest = blocks[0]
-        unseen = self._unseen_on(replace(view, camera=largest.camera), largest.window)
-        narrow = unseen.straight
+        def find_unseen(camera: Camera, window: Window) -> Unseen:
+            """Light and shade on the pixels of a window as this camera sees them."""
+            return self._unseen_on(replace(view, camera=camera), window)
+
+        narrow = find_unseen(blocks[0].camera, blocks[0].window).straight
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
-        edge_on = partial(self._light_edge_on, view)
-        return interpolated.solve(view, blocks, quadrature, edge_on, unseen.dark, least_peak, progress)
+        return interpolated.solve(view, blocks, quadrature, find_unseen, least_peak, progress)
 
 
 def _seen_state(view: View, window: Window) -> tuple[object, ...]:

@@ -47,8 +47,9 @@ class Draft:
     edge_on : light of surfaces edge-on as of `NarrowLight`, 0 unless it is set [W/mm²/sr]
     missed, narrow_radiance : light of narrow spots, and at last through narrow openings, that lines of sight may miss,
         and the largest radiance of these, 0 unless they are set [W/mm²/sr]
+    variation : change of each pixel by variation of J_n that lines of sight may miss, 0 unless it is set [W/mm²/sr]
     dark : dark bodies on the window, None unless they are set
-    by_narrow : True where that light or shade alone makes the error larger than the tolerance
+    by_narrow : True where that light, variation or shade alone makes the error larger than the tolerance
     outline : True within a pixel of lines of sight that meet a glowing surface and of others that do not
     shown : False on the rim of the window; one entry if there is none
     clipped, outside : the border of the image-plane stop crosses the pixel; the pixel lies beyond the stop
@@ -78,7 +79,7 @@ class Draft:
         self.sharp = grid.full(mi.Bool, False)
         self.nearest = grid.full(mi.Float64, dr.inf)
         self.roughness, self.lost, self.edge_on = (grid.full(mi.Float64, 0) for _ in range(3))
-        self.missed = grid.full(mi.Float64, 0)
+        self.missed, self.variation = (grid.full(mi.Float64, 0) for _ in range(2))
         self.narrow_radiance, self.by_narrow = 0.0, mi.Bool(False)
         self.dark: DarkBodies | None = None
         self.shown = grid.flat(window.shown()) if window.count < math.prod(window.shape) else mi.Bool(True)
@@ -152,9 +153,13 @@ class Draft:
         self.error = dr.select(self.computed, self.error, self.given_error)
 
     def set_narrow(self, narrow: NarrowLight) -> None:
-        """Set the light of surfaces that lines of sight may miss."""
-        self.edge_on, self.missed = (self.grid.flat(image) for image in (narrow.edge_on, narrow.at_most))
-        self.narrow_radiance = narrow.radiance
+        """Set the light of surfaces, and its variation, that lines of sight may miss."""
+        self.missed, self.narrow_radiance = self.grid.flat(narrow.at_most), narrow.radiance
+        self.set_surfaces(narrow)
+
+    def set_surfaces(self, narrow: NarrowLight) -> None:
+        """Set the light of surfaces edge-on, and the variation of J_n, alone."""
+        self.edge_on, self.variation = (self.grid.flat(image) for image in (narrow.edge_on, narrow.variation))
 
     def set_dark(self, dark: DarkBodies) -> None:
         """Set what dark bodies hide, and what passes between them, that lines of sight may miss."""
@@ -164,7 +169,14 @@ class Draft:
 
     def in_doubt(self) -> Mask:
         """Pixels on which dark bodies may take or let through more light than nodes show."""
-        light = dr.maximum(*self._by_dark_bodies())
+        return self._above(dr.maximum(*self._by_dark_bodies()))
+
+    def varied(self) -> Mask:
+        """Pixels on which J_n may vary more than nodes show."""
+        return self._above(self.variation)
+
+    def _above(self, light: PixelArray) -> Mask:
+        """True where light counts that nodes do not show."""
         return light > dr.opaque(mi.Float64, NARROW) * self.tolerance
 
     def _by_dark_bodies(self) -> tuple[PixelArray, PixelArray]:
@@ -177,10 +189,10 @@ class Draft:
         return self.grid.flat(self.dark.taken(light)), self.grid.flat(self.dark.let_through(light))
 
     def count_missed(self) -> None:
-        """Count narrow light and shade as errors of the pixels that no other solution gives."""
+        """Count narrow light, variation and shade as errors of the pixels that no other solution gives."""
         taken, let_through = self._by_dark_bodies()
         self.missed = dr.maximum(self.missed, let_through)
-        missed = dr.maximum(self.missed, taken)
+        missed = dr.maximum(dr.maximum(self.missed, self.variation), taken)
         error = dr.select(self.computed, dr.maximum(self.error, missed), self.error)
         self.by_narrow = (self.error <= self.tolerance) & (error > self.tolerance)
         self.error = error

@@ -32,11 +32,11 @@ from ..quadrature import FLOAT32_FLOOR, Quadrature
 from ..shortcuts import Finding
 from ..solution import Solution
 from . import node_rules
-from .dark_bodies import DarkBodies
 from .draft import Draft
 from .node_sums import apply_rule
 from .nodes import BOTH, first_nodes, twelve_nodes
 from .pupil_form import refine
+from .seen_points import Unseen
 from .transects import edges_of, integrate_by_transects
 
 # Pixels along the largest blocks; fewest blocks along the shorter side of an image for which blocks save time.
@@ -106,17 +106,15 @@ def solve(
     view: View,
     blocks: tuple[Blocks, ...],
     quadrature: Quadrature,
-    edge_on: Callable[[Window], Plane],
-    dark: DarkBodies,
+    find_unseen: Callable[[Camera, Window], Unseen],
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
     """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels.
 
-    edge_on : gives `NarrowLight.edge_on` on the pixels of a window
-    dark : bodies on the largest blocks
+    find_unseen : gives light and shade that lines of sight may miss on the pixels of a window, as a camera sees them
     """
-    image = _BlockImage(view, blocks, quadrature, edge_on, dark, least_peak)
+    image = _BlockImage(view, blocks, quadrature, find_unseen, least_peak)
     while image.own.any():
         image.compute(progress)
         if image.blocks.side == 1:
@@ -135,8 +133,8 @@ class _BlockImage:
 
     blocks, own : the present size; True where blocks are computed, False where larger ones gave their value
     edge : True for blocks on which the image may jump
-    dark : dark bodies on the largest blocks
-    narrow : True for blocks on which dark bodies, or openings between them, are narrow for a block
+    narrow : True for blocks on which dark bodies, or openings between them, are narrow for a block, or J_n varies
+        within it
     blur : least blur radius of an edge on a block or a neighbour [pixels]
     draft, refined : image of the present blocks in the pupil form; True where transects were taken
     passed_on : error of the pixels of a block that follows from the errors of the blocks around [W/mm²/sr]
@@ -150,11 +148,10 @@ class _BlockImage:
         view: View,
         sizes: tuple[Blocks, ...],
         quadrature: Quadrature,
-        edge_on: Callable[[Window], Plane],
-        dark: DarkBodies,
+        find_unseen: Callable[[Camera, Window], Unseen],
         least_peak: float,
     ) -> None:
-        self.edge_on_pixels, self.dark = edge_on, dark
+        self.find_unseen = find_unseen
         self.view, self.sizes, self.quadrature, self.peak = view, sizes, quadrature, least_peak
         self.blocks, shape = sizes[0], sizes[0].window.shape
         self.grid, self.own = Grid(shape), np.ones(shape, bool)
@@ -168,17 +165,17 @@ class _BlockImage:
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.computed, draft.given = grid.flat(self.own), grid.flat(self.value)
-        first = blocks is self.sizes[0]
-        draft.set_dark(self.dark if first else DarkBodies.seen(draft.view, blocks.window))
+        unseen = self.find_unseen(blocks.camera, blocks.window)
+        draft.set_surfaces(unseen.straight)
+        draft.set_dark(unseen.dark)
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)
         if blocks.side > 1:
             blur, self.refined = _refine_blurred(draft)
             grid.lay((blur < BLURRED) & (draft.outline | parted(draft.coverage)), self.edge)
             grid.lay(blur * blocks.side, self.blur)
             self.narrow = np.zeros(self.own.shape, bool)
-            grid.lay(draft.in_doubt(), self.narrow)
+            grid.lay(draft.in_doubt() | draft.varied(), self.narrow)
         else:
-            draft.edge_on = grid.flat(self.edge_on_pixels(blocks.window))
             refine(draft, np.broadcast_to(0.0, grid.shape))
         power, error, coverage = draft.images()
         images = (power / blocks.camera.etendue, error / blocks.camera.etendue, coverage)

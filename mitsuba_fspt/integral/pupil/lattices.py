@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 # points.
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 2, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
+# Part of the lines of sight that lattices may take together, which is kept for narrow light and variation of J_n.
+LEAST = 4
+FEWEST = 1 << 7  # points of the first lattice there, where so many pixels share these lines that it can have no more
 SHIFTS = 16
 ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
 CHANCE = 1e-3  # with which the stated error is exceeded, by Student's t, and as all points may miss light
@@ -50,13 +53,14 @@ def refine_by_lattices(draft: Draft) -> None:
     the brightest surface.
     """
     above, before = draft.shown & ~draft.outside & (draft.error > draft.tolerance), draft.rays
-    _refine(draft, above & ~draft.by_narrow, before, claimed=True)
-    _refine(draft, above & draft.by_narrow, before, claimed=False)
+    _refine(draft, above & ~draft.by_narrow, TOGETHER, claimed=True)
+    taken = _legs(draft.view.specular) * (draft.rays - before)
+    _refine(draft, above & draft.by_narrow, max(TOGETHER - taken, TOGETHER // LEAST), claimed=False)
 
 
-def _refine(draft: Draft, above: Mask, before: int, claimed: bool) -> None:
-    """Value and error of the marked pixels; `before`: lines of sight of the image before its lattices; `claimed` as of
-    `_most_points`."""
+def _refine(draft: Draft, above: Mask, together: int, claimed: bool) -> None:
+    """Value and error of the marked pixels; `together`, `claimed` as of `_most_points`."""
+    before = draft.rays
     deadline, tolerance = draft.progress.deadline, draft.tolerance
     rtol = dr.opaque(mi.Float64, draft.quadrature.rtol)
     legs = _legs(draft.view.specular)
@@ -64,11 +68,11 @@ def _refine(draft: Draft, above: Mask, before: int, claimed: bool) -> None:
     def most_points(pixels: int, points: int = 0) -> int:
         """Points of the largest lattice that so many pixels may take next, after one of so many points."""
         on_others = draft.rays - before - points * SHIFTS * pixels
-        return _most_points(draft.quadrature, legs, pixels, on_others, claimed)
+        return _most_points(draft.quadrature, legs, pixels, together - legs * on_others, claimed)
 
     if not dr.any(above) or most_points(1) < FIRST:
         return
-    above = _largest_errors(draft, above, most_points)
+    above = _largest_errors(draft, above, most_points, FIRST if claimed else FEWEST)
     narrow, largest = (dr.opaque(mi.Float64, n) for n in (draft.narrow_radiance, most_radiance(draft.view.scene)))
     brightest = dr.maximum(draft.near_edge(draft.value), dr.select(draft.missed > 0, narrow, 0))
     brightest = dr.select(draft.computed, brightest, largest)
@@ -111,28 +115,29 @@ def _exceeded_with(chance: float) -> tuple[float, float]:
     return float(stdtrit(SHIFTS - 1, 1 - chance / 2)), -math.log(chance)
 
 
-def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int]) -> Mask:
-    """The marked pixels, or as many of them as may take the first lattice: those of the largest errors.
+def _largest_errors(draft: Draft, above: Mask, most_points: Callable[[int], int], least: int = FIRST) -> Mask:
+    """The marked pixels, or as many of them as may take a lattice of at `least` so many points: those of the largest
+    errors.
 
     Of equal errors, which neighbours may have, no more than that are taken.
     """
     error = dr.select(above, draft.error, 0).numpy()
     count = int(np.count_nonzero(error))
-    while most_points(count) < FIRST:
+    while most_points(count) < least:
         count //= 2
     taken = np.zeros(len(error), bool)
     taken[np.argpartition(error, -count)[-count:]] = True
     return above & from_numpy(mi.Bool, taken)
 
 
-def _most_points(quadrature: Quadrature, legs: int, pixels: int, taken: int = 0, claimed: bool = True) -> int:
+def _most_points(quadrature: Quadrature, legs: int, pixels: int, left: int = TOGETHER, claimed: bool = True) -> int:
     """Points of the largest lattice on so many pixels, a power of two, of lines of sight that count as so many.
 
-    taken : lines of sight of smaller lattices on other pixels; claimed : each pixel may take `most_nodes` in any case
+    left : lines of sight of all pixels together; claimed : each pixel may take `most_nodes` in any case
     """
     lines = quadrature.most_nodes
     if quadrature.max_nodes is None:
-        lines = max(lines if claimed else 0, (TOGETHER - legs * taken) // pixels, 0) // legs
+        lines = max(lines if claimed else 0, left // pixels, 0) // legs
     return min(1 << (lines // SHIFTS).bit_length() >> 1, MOST)
 
 
@@ -178,27 +183,28 @@ class Means:
 
         After the deadline only those of the pixels for which there was time.
         """
-        runs, done = (more - points) // FIRST, 0
+        run, done = min(FIRST, more - points), 0
+        runs = (more - points) // run
         shifts = dr.arange(mi.UInt32, dr.width(self.pixels) * SHIFTS)
         sums = [dr.zeros(mi.Float64, dr.width(shifts)) for _ in range(2)]
         # One kernel for lattices of all sizes: it contains neither numbers of points nor the sums over runs.
         of_shift, start = dr.opaque(mi.UInt32, runs), dr.opaque(mi.UInt32, points)
-        for part in batches(shifts, FIRST * runs, draft.progress.batch):
+        for part in batches(shifts, run * runs, draft.progress.batch):
             if done and draft.progress.deadline.passed():
                 break
             done += dr.width(part)
             entry = dr.arange(mi.UInt32, dr.width(part) * runs)
             shift = dr.gather(mi.UInt32, part, entry // of_shift)
-            first = start + entry % of_shift * dr.opaque(mi.UInt32, FIRST)
+            first = start + entry % of_shift * dr.opaque(mi.UInt32, run)
             dr.eval(shift, first)
-            columns = _run(draft, self.pixels, shift, first)
+            columns = _run(draft, self.pixels, shift, first, run)
             dr.eval(columns)
             for total, column in zip(sums, columns, strict=True):
                 dr.scatter(total, dr.block_sum(column, runs), part)
             dr.eval(sums)
         whole = done // SHIFTS  # array entries of one pixel follow one another
         touched = dr.gather(mi.UInt32, self.pixels, dr.arange(mi.UInt32, whole))
-        draft.count(f"{SHIFTS} lattices of {more}", touched, done * runs * FIRST)
+        draft.count(f"{SHIFTS} lattices of {more}", touched, done * runs * run)
         old, new = (dr.opaque(mi.Float64, share) for share in (points / more, 1 / more))
         radiance, coverage = (
             old * before + new * total for before, total in zip((self.radiance, self.coverage), sums, strict=True)
@@ -210,8 +216,10 @@ class Means:
         return found.of(dr.arange(mi.UInt32, dr.width(self.pixels)) < whole)
 
 
-def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) -> tuple[PixelArray, PixelArray]:
-    """Sums of integrand and coverage over `FIRST` points from number `first` on, for each `shift` of `pixels`."""
+def _run(
+    draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32, count: int
+) -> tuple[PixelArray, PixelArray]:
+    """Sums of integrand and coverage over `count` points from number `first` on, for each `shift` of `pixels`."""
     pixel = dr.gather(mi.UInt32, pixels, shift // SHIFTS)
     centre, area = draft.centres(pixel), dr.opaque(mi.Float, float(draft.area))
     shifts = [mi.sample_tea_32(pixel, SHIFTS * k + shift % SHIFTS)[0] for k in range(len(VECTOR))]
@@ -226,7 +234,7 @@ def _run(draft: Draft, pixels: mi.UInt32, shift: mi.UInt32, first: mi.UInt32) ->
         sight = draft.view.integrand(centre + area * mi.Point2f(x - 0.5, y - 0.5), pupil)
         return value + mi.Float64(sight.integrand), coverage + dr.select(sight.covered, mi.Float64(1), 0)
 
-    return repeat(dr.opaque(mi.UInt32, FIRST), add, mi.Float64(0), mi.Float64(0))
+    return repeat(dr.opaque(mi.UInt32, count), add, mi.Float64(0), mi.Float64(0))
 
 
 def _folded(place: mi.UInt32) -> mi.Float:

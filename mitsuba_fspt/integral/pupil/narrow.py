@@ -2,7 +2,9 @@
 
 Four nodes of Eq. M.5 a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where
 that is larger. They may miss smaller bodies and spots, and error estimates from the nodes do not show that. Such light
-is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9).
+is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9). Nor do nodes show
+variation of J_n that is finer than they are apart, such as dark lines on a bright surface: points tell how much of it a
+pixel may have.
 
 A surface whose tangent plane crosses the pupil shines on a part of it. Where it is deep, as the flat end of a cylinder,
 its nearer and its farther rim are edges of different blur on one pixel, of which few transects may miss one.
@@ -32,17 +34,22 @@ from ...jit.from_numpy import from_numpy
 from ...jit.loops import repeat
 from ...jit.pixel_grid import Grid
 from ...jit.spectra import at_one_wavelength, scalar
+from ..lines.occlusion import hides_nothing
 from ..lines.specular import Specular, transmission
 from .node_rules import PLASTIC, twelve
 
 NARROW = 0.1  # of the tolerance: pixels with more light of narrow spots, or shade, do not rely on lines of sight alone
-UNCERTAINTY = 2.0  # largest ratio of narrow light and its estimate
+UNCERTAINTY = 2.0  # largest ratio of narrow light, or of variation, and its estimate
 OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than every square around, in focus
 # The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
 # body covers at least the share `COVERED` of a square around, the point is at most `GLARES` times as bright as that.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
+# Largest cosine to the lens of a surface whose variation counts as that of a limb; largest share of a square that one
+# surface covers.
+GRAZING, SINGLE = 0.25, 1.1
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 WIDE, MOST_POINTS = 2.0, 1 << 12  # least width of a wide element [pixels, blur radii]; most points of a thin one
+SHARP = 0.5  # blur radius [pixels] below which a point counts on its own pixel and those beside it
 LARGEST_GRID = 1 << 12  # cells along each side of the grid
 
 Column = NDArray[np.float64]
@@ -56,7 +63,8 @@ class NarrowLight:
     of these on each pixel as if they were in focus; and of surfaces edge-on, times the difference of their blur radii
     [pixels], at most 1.
 
-    Mean radiance on film [W/mm²/sr], to a factor of two. `radiance`: the largest one of narrow spots [W/mm²/sr].
+    Mean radiance on film [W/mm²/sr], to a factor of two. `radiance`: the largest one of narrow spots [W/mm²/sr];
+    `variation`: the largest change of each pixel by variation of J_n finer than lines of sight are apart.
     """
 
     on_pixels: PixelArray
@@ -64,11 +72,12 @@ class NarrowLight:
     in_focus: PixelArray
     edge_on: PixelArray
     radiance: float
+    variation: PixelArray
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> NarrowLight:
         """Of a window on which no surface shines."""
-        return cls(np.zeros(shape), 0.0, np.zeros(shape), np.zeros(shape), 0.0)
+        return cls(np.zeros(shape), 0.0, np.zeros(shape), np.zeros(shape), 0.0, np.zeros(shape))
 
     @property
     def at_most(self) -> PixelArray:
@@ -82,14 +91,14 @@ class NarrowLight:
             on_pixels=self.on_pixels + elsewhere.on_pixels,
             edge_on=self.edge_on + elsewhere.edge_on,
             radiance=max(self.radiance, elsewhere.radiance),
+            variation=self.variation + elsewhere.variation,
         )
 
     def times(self, share: PixelArray) -> NarrowLight:
-        """These shares (h, w) of the narrow light and of surfaces edge-on."""
+        """These shares (h, w) of the narrow light, of surfaces edge-on and of the variation."""
         most = float(share.max(initial=0.0))
-        return replace(
-            self, on_pixels=self.on_pixels * share, edge_on=self.edge_on * share, radiance=self.radiance * most
-        )
+        images = {name: getattr(self, name) * share for name in ("on_pixels", "edge_on", "variation")}
+        return replace(self, radiance=self.radiance * most, **images)
 
 
 def points_on_surfaces(
@@ -100,6 +109,7 @@ def points_on_surfaces(
     Along straight lines only, also through `specular` shapes. `hidden`: those that other surfaces hide are dark.
     """
     parts = [_seen(scene, surface, camera, specular, hidden) for surface in surfaces_of(scene)]
+    parts = [replace(part, varied=number * part.varied) for number, part in enumerate(parts, 1)]
     return Points.joined(parts) if parts else None
 
 
@@ -107,7 +117,7 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
     """The part of the light of points all over the surfaces that comes from narrow spots; 0 without points."""
     if points is None or not math.prod(window.shape):
         return NarrowLight.none(window.shape)
-    on_pixels, points = np.zeros(window.shape), points.seen_in(window)
+    on_pixels, variation, points = np.zeros(window.shape), np.zeros(window.shape), points.seen_in(window)
     if not (points.radiance > 0).any():
         return NarrowLight.none(window.shape)
     light, level = points.light(), points.level()
@@ -120,14 +130,21 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
         if (counts := here & shown).any():
             brightest = max(brightest, points[counts].cells(2**k).sums(light[counts]).max())
         there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
-        here[there] &= _hidden(points[there], 2**k)
         here &= there & (points.apart < 1)
+        if not here.any():
+            continue
+        for number in np.unique(points.varied[here & (points.varied > 0)]):
+            near = there & (points.varied == number)
+            off = np.where(here[near], _beyond(points[near], 2**k), 0)
+            if (fine := off > 0).any():
+                variation += UNCERTAINTY * most_on_pixels(points[near][fine], off[fine], window.shape)
+        here[there] &= _hidden(points[there], 2**k)
         if here.any():
             on_pixels += spread(light[here], points[here], reach, window.shape)
             radiance = max(radiance, float(points.radiance[here].max()))
     in_focus = points.on_pixels(light, window.shape)
     edge_on = _edge_on(points, light, window.shape)
-    return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance)
+    return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance, variation)
 
 
 def most_narrow_light(points: Points | None) -> float:
@@ -181,6 +198,8 @@ class Points:
     """Points all over surfaces, columns (n,).
 
     radiance : to the lens; 0 where a point has no image, or another body hides it
+    varied : number, from 1, of a surface on which J_n varies; 0 on others, where a point has no image, or another body
+        hides it
     area : of the sharp image that it stands for [pixels²]
     cosine, front : the largest cosine of the normal to a point of the pupil; > 0 if the pupil's middle sees the point
     edge_on : 1 if the tangent plane crosses the pupil, so that a part of it does not see the point; 0 if not
@@ -189,6 +208,7 @@ class Points:
     """
 
     radiance: Column
+    varied: Column
     area: Column
     cosine: Column
     front: Column
@@ -295,6 +315,29 @@ def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
     return (points.radiance > OUTSHINES * around) & ~limb
 
 
+def _beyond(points: Points, side: float) -> Column:
+    """Largest difference of the radiance of each point of a surface from means over squares of a `side` [pixels], its
+    own and all around, where it is outside their range, extended by itself on both ends; 0 elsewhere [W/mm²/sr].
+
+    Where J_n is smooth, or steps between two values, all points are within the extended range. The radiance may vary
+    within a square where one part of the surface lies before another, and at the limb of a body.
+    """
+    cells = points.cells(side)
+    grid = Grid(cells.shape)
+    share = np.minimum(points.area / side**2, 1)
+    light, covered, count = (cells.sums(weight) for weight in (points.radiance * share, share, np.ones_like(share)))
+    mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
+    several = covered > SINGLE + 2 * np.sqrt(covered / np.maximum(count, 1))  # twice the side of what a point stands for
+    known = np.where(covered > COVERED, mean, np.nan)  # the rest of others belongs to larger elements
+    high, low, behind = (
+        grid.array(grid.spread_max(grid.flat(np.nan_to_num(image, nan=-np.inf)))).ravel()[cells.number]
+        for image in (known, -known, several.astype(np.float64))
+    )
+    off = np.maximum(points.radiance + low, high - points.radiance)
+    single = (points.cosine > GRAZING) & (behind == 0)
+    return np.where(single & (off > 2 * (high + low)), off, 0)
+
+
 @dataclass(frozen=True)
 class _Cells:
     """Cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
@@ -319,6 +362,21 @@ def spread(light: Column, points: Points, reach: int, shape: tuple[int, int]) ->
     return grid.array(grid.box_sum(grid.flat(sums), reach))[reach : reach + height, reach : reach + width]
 
 
+def most_on_pixels(points: Points, each: Column, shape: tuple[int, int]) -> PixelArray:
+    """Largest sum (h, w) of what `each` point gives, times the share of the pixel, or of its blur disc, that it
+    covers."""
+    sharp = points.blur < SHARP
+    image = np.zeros(shape)
+    image += maximum_filter(points[sharp].on_pixels(points[sharp].area * each[sharp], shape), 3)
+    blurred, each = points[~sharp], each[~sharp]
+    covered, level = replace(blurred, radiance=np.ones_like(blurred.radiance)).light(), blurred.level()
+    for k in np.unique(level):
+        here = level == k
+        reach = max(math.ceil(blurred.blur[here].max()), 1)
+        image += spread(covered[here] * each[here], blurred[here], reach, shape)
+    return image
+
+
 def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None, hidden: bool) -> Points:
     """Points all over a surface, with their images."""
     shape = surface.shape
@@ -331,8 +389,9 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     def radiance(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
         return scalar(surface.radiance(si, to_lens, mi.Bool(True)))
 
-    hides = hidden and len(scene.shapes()) > 1
-    return points_of(elements, camera, radiance, partial(in_sight, scene, camera, specular) if hides else None)
+    hides = hidden and (len(scene.shapes()) > 1 or not (surface.is_uniform() or hides_nothing(scene)))
+    points = points_of(elements, camera, radiance, partial(in_sight, scene, camera, specular) if hides else None)
+    return replace(points, varied=np.zeros_like(points.varied)) if surface.is_uniform() else points
 
 
 def points_of(
@@ -353,16 +412,20 @@ def points_of(
     thin = np.isfinite(reach) & ((area < WIDE * unit**2 * reach) | crossed) & ~long
     counts = np.ceil(np.where(thin, 4 * reach, 1)).clip(1, MOST_POINTS).astype(np.int64)
     at = _on_elements(elements, radiance, camera, counts)
+    shown = dr.full(mi.Float, 1, dr.width(at.image))
     if visible:
-        at.radiance = dr.select(visible(at.place, at.normal), at.radiance, 0)
-    columns = (at.radiance, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
+        shown = dr.select(visible(at.place, at.normal), shown, 0)
+    columns = (shown * at.radiance, shown, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)
-    radiance, image, cosine, front, edge_on, blur, x, y = np.nan_to_num(seen, posinf=np.finfo(np.float32).max, neginf=0)
+    radiance, shown, image, cosine, front, edge_on, blur, x, y = np.nan_to_num(
+        seen, posinf=np.finfo(np.float32).max, neginf=0
+    )
     # An element half as thick as a unit covers half of some square: its points are not narrow.
     apart = np.repeat(np.where(area < unit**2 * reach, reach / counts, np.inf), counts)
     image = image / np.repeat(counts, counts)
-    return Points(np.where(unseen, 0, radiance), image, cosine, front, edge_on, apart, blur, x, y)
+    radiance, shown = (np.where(unseen, 0, column) for column in (radiance, shown))
+    return Points(radiance, shown, image, cosine, front, edge_on, apart, blur, x, y)
 
 
 @dataclass

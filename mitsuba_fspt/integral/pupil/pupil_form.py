@@ -108,7 +108,8 @@ def refine(
     if by_faces:
         faces = _Faces(draft, by_faces, np.zeros(draft.window.shape, bool) if on_faces is None else on_faces)
         beside = on_faces is not None and on_faces.any()
-        rough = faces(rough, (BESIDE_NARROW if beside else FIRST_LINES) if levels else 0.0)
+        left = faces(rough | draft.varied(), (BESIDE_NARROW if beside else FIRST_LINES) if levels else 0.0)
+        rough = left if faces.taken else rough
     if not levels:
         draft.spread_error(rough)
     elif dr.any(rough):
@@ -192,6 +193,7 @@ class _Faces:
         and those that are not refined further."""
         draft = self.draft
         power, error, coverage = self._images(found)
+        draft.error = dr.select(wanted, dr.maximum(draft.error, draft.variation), draft.error)
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
         tolerance = dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest
         self._count_unmet(wanted, power)

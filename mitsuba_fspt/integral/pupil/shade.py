@@ -14,7 +14,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from ...camera.camera import Camera
 from ...camera.window import Window, corners_of
@@ -26,7 +25,7 @@ from ...jit.from_numpy import from_numpy
 from ...jit.spectra import scalar
 from ..lines.eq9 import View
 from ..lines.specular import only_hides
-from .narrow import FEWEST_ELEMENTS, Points, points_of, spread
+from .narrow import FEWEST_ELEMENTS, Points, most_on_pixels, points_of
 
 # Shapes that are no meshes on which points can be placed by their parameters.
 PLACEABLE = ("Sphere", "Cylinder", "Disk", "BSplineCurve")
@@ -36,7 +35,6 @@ RING, RING_RADIUS, RING_COVERED = 8, 0.3, 0.3
 WIDE_BALL = 4.0  # least width of the box of a ball without narrow parts [pixels, and blur radii]
 CELL = 0.25  # side of the cells of whose points one is examined for all, likewise
 ROUNDING = 1e-3  # of a radiance
-SHARP = 0.5  # blur radius [pixels] below which a point shades its own pixel and those beside it
 
 Column = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -128,17 +126,8 @@ def _end_on_dark(view: View, x: Column, y: Column, radiance: float) -> Mask:
 def shade(points: Points | None, window: Window) -> tuple[PixelArray, PixelArray]:
     """Largest share (h, w) of the lines of sight of each pixel that narrow bodies block, and the light of these bodies
     there [W/mm²/sr], to a factor of two."""
-    share, own = (np.zeros(window.shape) for _ in range(2))
     if points is None or not math.prod(window.shape):
-        return share, own
+        return np.zeros(window.shape), np.zeros(window.shape)
     points = points.seen_in(window)
-    sharp, blurred = points[points.blur < SHARP], points[points.blur >= SHARP]
-    for image, light in ((share, sharp.area), (own, sharp.area * sharp.radiance)):
-        image += maximum_filter(sharp.on_pixels(light, window.shape), 3)
-    covered, level = replace(blurred, radiance=np.ones_like(blurred.radiance)).light(), blurred.level()
-    for k in np.unique(level):
-        here = level == k
-        reach, some = max(math.ceil(blurred.blur[here].max()), 1), blurred[here]
-        share += spread(covered[here], some, reach, window.shape)
-        own += spread(covered[here] * some.radiance, some, reach, window.shape)
+    share, own = (most_on_pixels(points, of, window.shape) for of in (np.ones_like(points.x), points.radiance))
     return share.clip(max=1), own
