@@ -418,9 +418,9 @@ MUTANTS = (
     ),
     Mutant(
         "sign of the dark charge",
-        "detector/reduction.py",
-        'detector.on_pixels("bias", shape) + charge / gain, charge',
-        'detector.on_pixels("bias", shape) - charge / gain, charge',
+        "detector/dark_charge.py",
+        "Background(own + charge / gain, charge)",
+        "Background(own - charge / gain, charge)",
         (REDUCTION,),
     ),
     Mutant(
@@ -455,7 +455,7 @@ MUTANTS = (
     ),
     Mutant(
         "spurious charge of a bias frame",
-        "detector/reduction.py",
+        "detector/dark_charge.py",
         "empty.values + dark_charge / gain",
         "empty.values + charge / gain",
         (CAMERAS,),

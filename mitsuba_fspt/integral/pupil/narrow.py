@@ -327,15 +327,16 @@ def _beyond(points: Points, side: float) -> Column:
     share = np.minimum(points.area / side**2, 1)
     light, covered, count = (cells.sums(weight) for weight in (points.radiance * share, share, np.ones_like(share)))
     mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
-    several = covered > SINGLE + 2 * np.sqrt(covered / np.maximum(count, 1))  # twice the side of what a point stands for
+    unit = np.sqrt(covered / np.maximum(count, 1))  # of what a point stands for, twice as much as squares may have more
+    several = covered > SINGLE + 2 * unit
     known = np.where(covered > COVERED, mean, np.nan)  # the rest of others belongs to larger elements
-    high, low, behind = (
+    high, minus_low, behind = (
         grid.array(grid.spread_max(grid.flat(np.nan_to_num(image, nan=-np.inf)))).ravel()[cells.number]
         for image in (known, -known, several.astype(np.float64))
     )
-    off = np.maximum(points.radiance + low, high - points.radiance)
+    off = np.maximum(points.radiance + minus_low, high - points.radiance)
     single = (points.cosine > GRAZING) & (behind == 0)
-    return np.where(single & (off > 2 * (high + low)), off, 0)
+    return np.where(single & (off > 2 * (high + minus_low)), off, 0)
 
 
 @dataclass(frozen=True)
