@@ -853,8 +853,8 @@ MUTANTS = (
     Mutant(
         "fine variation of J_n",
         "integral/pupil/draft.py",
-        "dr.maximum(self.missed, self.variation)",
-        "dr.maximum(self.missed, 0 * self.variation)",
+        "dr.maximum(self.missed, self.unseen_variation())",
+        "dr.maximum(self.missed, 0 * self.unseen_variation())",
         ("tests/integral/test_fine_variation.py",),
     ),
     Mutant(

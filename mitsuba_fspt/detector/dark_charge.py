@@ -22,7 +22,7 @@ from .parameters import DetectorParameters
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("mitsuba_fspt")
-DARKEST = 1.0  # percent of the pixels, which have no light or less than others
+DARKEST = 10.0  # percent of the pixels, which have no light or less than others; bad ones are fewer
 SURE = 5.0  # standard deviations of a dark frame less the bias: noise alone makes a pixel so bright once in 3 million
 
 
@@ -108,21 +108,22 @@ def background_of(
 
 
 def tell_below_bias(counts: Array, bias: Array | float, noise: float, name: str, level: Array | float) -> None:
-    """Say in one line on stderr that a frame without light is darker than the bias of the detector, and the counts are
-    not: the bias has been subtracted from the frame, as from darks that were reduced before, but not from the counts.
+    """Say in one line on stderr that a frame without light has less than half of the bias of the detector, and the
+    counts have more: the bias has been subtracted from the frame, as from darks that were reduced before, but not from
+    the counts.
 
     counts : (h, w) [DN];  bias : of the detector [DN];  noise : of reading a pixel [DN]
     name : of the frame;  level : of its pixels [DN]
     """
-    below = float(np.median(bias - level))
-    if below > SURE * noise and float(np.percentile(counts - level, DARKEST)) > below / 2:
+    middle, below = float(np.median(bias)), float(np.median(bias - level))
+    if below > max(SURE * noise, middle / 2) and float(np.percentile(counts - level, DARKEST)) > below / 2:
         LOG.warning(
             "fspt: reduce: '%s' is %.3g DN below the bias of the detector, %.4g DN, which counts have without light. "
             "If the bias was subtracted from it before, the image is too bright by that. Give frames as they are read "
             "out, or correct 'bias'.",
             name,
             below,
-            float(np.median(bias)),
+            middle,
         )
 
 

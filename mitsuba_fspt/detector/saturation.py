@@ -20,8 +20,8 @@ WHOLE = 1e-3  # deviation of a sum of frames from a whole number that rounding m
 MANY = 5  # pixels: fewer at the largest count are passed over
 FEWEST_BITS = 8  # of a converter
 # Second differences over their standard deviation: the least median that noise makes, and the largest that is no edge;
-# number of them that tells.
-NOISY, EDGE, ENOUGH = 0.3, 5.0, 100
+# number of them that tells; least deviation of noise over the step of the counts, by whose rounding they are 0.14.
+NOISY, EDGE, ENOUGH, COARSE = 0.3, 5.0, 100, 3.0
 WINDOW = 2.0  # standard deviations to each side of a value, within which other counts of equal light lie
 
 
@@ -87,7 +87,7 @@ def unknown_ceiling(detector: DetectorParameters, counts: Array, frames: int = 1
     share = 1 - norm.sf(depth + step / _sigma(detector, values[-1], frames)) / norm.sf(depth)
     if reached * np.log(share) > np.log(CHANCE):
         return None
-    noisy = _neighbours_differ(detector, counts, frames)
+    noisy = _neighbours_differ(detector, counts, step, frames)
     if not noisy and _without_noise(detector, values[:-1], numbers[:-1], step, frames):
         return None
     return float(values[-1])
@@ -104,18 +104,20 @@ def _step(values: Array, frames: int) -> float:
     return float(np.gcd.reduce(np.diff(whole).astype(np.int64))) / frames
 
 
-def _neighbours_differ(detector: DetectorParameters, counts: Array, frames: int) -> bool:
+def _neighbours_differ(detector: DetectorParameters, counts: Array, step: float, frames: int) -> bool:
     """True if second differences d along rows of counts (h, w) [DN] are as large as noise makes them.
 
-    The median of |d|/(√6 σ) is 0.67 by normal noise, and 0 of smooth counts without noise. Three equal counts in a row,
-    counts at the ceiling and edges in the image are left out.
+    The median of |d|/(√6 σ) is 0.67 by normal noise. Of smooth counts without noise |d| is the `step` [DN] of rounding,
+    which tells nothing where σ is not `COARSE` times as large. Three equal counts in a row, counts at the ceiling and
+    edges in the image are left out.
     """
     if counts.ndim != 2 or counts.shape[1] < 3:
         return False
     left, middle, right = counts[:, :-2], counts[:, 1:-1], counts[:, 2:]
-    ratio = np.abs(left - 2 * middle + right) / (math.sqrt(6) * _sigma(detector, middle, frames))
+    sigma = _sigma(detector, middle, frames)
+    ratio = np.abs(left - 2 * middle + right) / (math.sqrt(6) * sigma)
     used = ((left != middle) | (middle != right)) & (np.maximum(np.maximum(left, middle), right) < counts.max())
-    used &= ratio < EDGE
+    used &= (ratio < EDGE) & (sigma > COARSE * step)
     return bool(used.sum() >= ENOUGH and np.median(ratio[used]) > NOISY)
 
 

@@ -224,6 +224,18 @@ def texels_of(texture: mi.Texture) -> int:
     return round(min(math.prod(values["data"].shape[:2]) * tiles, MOST_TEXELS))
 
 
+def square_texels_of(texture: mi.Texture) -> int:
+    """Number of squares on the unit square of (u, v) of which each has a texel's shorter side, at most `MOST_TEXELS`; 1
+    without a bitmap.
+    """
+    values = mi.traverse(texture)
+    if "data" not in values:
+        return 1
+    of_texels = np.array(values["data"].shape[1::-1])[:, None]  # columns and rows on the unit square of the bitmap
+    along = of_texels * np.abs(np.array(values["to_uv"].matrix, np.float64).reshape(3, 3)[:2, :2])
+    return round(min(max(float(along.max()), 1.0) ** 2, MOST_TEXELS))
+
+
 def check_values(shape: mi.Shape, texture: mi.Texture) -> float:
     """Largest J_n [W/mm²] of the corners and centres of a shape's elements; 0 where nothing glows.
 

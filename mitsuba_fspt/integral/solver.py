@@ -55,7 +55,7 @@ class Solver:
         # A reference to the scene itself would be a cycle: the integrator that holds this solver is its child.
         self._traced = TracedScene()
         self._window = CachedValue()
-        self._unseen: dict[float, CachedValue] = defaultdict(CachedValue)  # of each pixel pitch, as blocks have
+        self._unseen: dict[int, CachedValue] = defaultdict(CachedValue)  # by the side of blocks, 0 of the whole image
         self._faces, self._seen_faces, self._grid_of_blocks = (CachedValue() for _ in range(3))
 
     def solve(
@@ -148,11 +148,11 @@ class Solver:
             return find()
         return self._seen_faces.recall(state, find, [geometry_of(shape) for shape in shapes])
 
-    def _unseen_on(self, view: View, window: Window) -> Unseen:
-        """Light and shade that lines of sight may miss on the pixels of a window; cached."""
+    def _unseen_on(self, view: View, window: Window, side: int = 0) -> Unseen:
+        """Light and shade that lines of sight may miss on the pixels of a window, or on blocks of a `side`; cached."""
         held = [geometry_of(shape) for shape in view.scene.shapes()]
         state = _seen_state(view, window)
-        return self._unseen[view.camera.pixel_pitch].recall(state, lambda: SeenPoints.of(view).unseen(window), held)
+        return self._unseen[side].recall(state, lambda: SeenPoints.of(view).unseen(window), held)
 
     def _fill(
         self,
@@ -274,11 +274,11 @@ class Solver:
         """Solution with values interpolated between blocks; None if that saves no lines of sight."""
 
         # Light that is narrow for a pixel is narrow for a block, too.
-        def find_unseen(camera: Camera, window: Window) -> Unseen:
-            """Light and shade on the pixels of a window as this camera sees them."""
-            return self._unseen_on(replace(view, camera=camera), window)
+        def find_unseen(some: Blocks) -> Unseen:
+            """Light and shade on blocks."""
+            return self._unseen_on(replace(view, camera=some.camera), some.window, some.side)
 
-        narrow = find_unseen(blocks[0].camera, blocks[0].window).straight
+        narrow = find_unseen(blocks[0]).straight
         if (narrow.on_pixels > NARROW * quadrature.rtol * max(narrow.brightest, least_peak)).any():
             return None
         return interpolated.solve(view, blocks, quadrature, find_unseen, least_peak, progress)

@@ -18,7 +18,7 @@ from ..progress import SILENT, Progress
 from ..quadrature import Quadrature
 from ..solution import Solution
 from . import node_rules
-from .narrow import NARROW
+from .narrow import NARROW, SHARP
 
 if TYPE_CHECKING:
     from ...jit.pixel_grid import Mask, PixelArray
@@ -173,7 +173,11 @@ class Draft:
 
     def varied(self) -> Mask:
         """Pixels on which J_n may vary more than nodes show."""
-        return self._above(self.variation)
+        return self._above(self.unseen_variation())
+
+    def unseen_variation(self) -> PixelArray:
+        """`variation`; the middle of a pixel sees none where it is in focus."""
+        return self.variation if self.area else dr.select(self.blur < SHARP, 0, self.variation)
 
     def _above(self, light: PixelArray) -> Mask:
         """True where light counts that nodes do not show."""
@@ -192,7 +196,7 @@ class Draft:
         """Count narrow light, variation and shade as errors of the pixels that no other solution gives."""
         taken, let_through = self._by_dark_bodies()
         self.missed = dr.maximum(self.missed, let_through)
-        missed = dr.maximum(dr.maximum(self.missed, self.variation), taken)
+        missed = dr.maximum(dr.maximum(self.missed, self.unseen_variation()), taken)
         error = dr.select(self.computed, dr.maximum(self.error, missed), self.error)
         self.by_narrow = (self.error <= self.tolerance) & (error > self.tolerance)
         self.error = error

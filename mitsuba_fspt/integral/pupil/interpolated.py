@@ -106,13 +106,13 @@ def solve(
     view: View,
     blocks: tuple[Blocks, ...],
     quadrature: Quadrature,
-    find_unseen: Callable[[Camera, Window], Unseen],
+    find_unseen: Callable[[Blocks], Unseen],
     least_peak: float = 0.0,
     progress: Progress = SILENT,
 ) -> Solution | None:
     """As `pupil_form.solve`, with values between blocks interpolated; None if most blocks are divided into pixels.
 
-    find_unseen : gives light and shade that lines of sight may miss on the pixels of a window, as a camera sees them
+    find_unseen : gives light and shade that lines of sight may miss on blocks
     """
     image = _BlockImage(view, blocks, quadrature, find_unseen, least_peak)
     while image.own.any():
@@ -148,7 +148,7 @@ class _BlockImage:
         view: View,
         sizes: tuple[Blocks, ...],
         quadrature: Quadrature,
-        find_unseen: Callable[[Camera, Window], Unseen],
+        find_unseen: Callable[[Blocks], Unseen],
         least_peak: float,
     ) -> None:
         self.find_unseen = find_unseen
@@ -165,7 +165,7 @@ class _BlockImage:
         progress = progress.part(self.sizes.index(blocks), len(self.sizes))
         draft = Draft(self._seen(), blocks.window, self._quadrature(), None, self.peak, progress, grid)
         draft.computed, draft.given = grid.flat(self.own), grid.flat(self.value)
-        unseen = self.find_unseen(blocks.camera, blocks.window)
+        unseen = self.find_unseen(blocks)
         draft.set_surfaces(unseen.straight)
         draft.set_dark(unseen.dark)
         self.edge, self.blur = np.zeros(self.own.shape, bool), np.zeros(self.own.shape)

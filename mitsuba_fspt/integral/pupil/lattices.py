@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 # points.
 VECTOR = (1, 949661, 683229, 634757)
 FIRST, GROWTH, MOST = 1 << 10, 2, 1 << 18  # points of the first lattice; by what factor the next has more; of the last
-# Part of the lines of sight that lattices may take together, which is kept for narrow light and variation of J_n.
-LEAST = 4
+LEAST = TOGETHER // 4  # lines of sight that are kept for narrow light, shade and variation of J_n
 FEWEST = 1 << 7  # points of the first lattice there, where so many pixels share these lines that it can have no more
 SHIFTS = 16
 ORDER = 3 / 4  # power with which the error is expected to fall with the number of points, as at a jump
@@ -55,7 +54,7 @@ def refine_by_lattices(draft: Draft) -> None:
     above, before = draft.shown & ~draft.outside & (draft.error > draft.tolerance), draft.rays
     _refine(draft, above & ~draft.by_narrow, TOGETHER, claimed=True)
     taken = _legs(draft.view.specular) * (draft.rays - before)
-    _refine(draft, above & draft.by_narrow, max(TOGETHER - taken, TOGETHER // LEAST), claimed=False)
+    _refine(draft, above & draft.by_narrow, max(TOGETHER - taken, LEAST), claimed=False)
 
 
 def _refine(draft: Draft, above: Mask, together: int, claimed: bool) -> None:

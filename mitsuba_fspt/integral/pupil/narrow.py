@@ -2,9 +2,7 @@
 
 Four nodes of Eq. M.5 a pixel detect light from a region as large as a pixel at the phantom, or as its blur disc where
 that is larger. They may miss smaller bodies and spots, and error estimates from the nodes do not show that. Such light
-is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9). Nor do nodes show
-variation of J_n that is finer than they are apart, such as dark lines on a bright surface: points tell how much of it a
-pixel may have.
+is detected from points all over the surfaces; the pixels that it reaches take the surface form (M.9).
 
 A surface whose tangent plane crosses the pupil shines on a part of it. Where it is deep, as the flat end of a cylinder,
 its nearer and its farther rim are edges of different blur on one pixel, of which few transects may miss one.
@@ -27,7 +25,7 @@ from ...camera.camera import Camera
 from ...camera.window import Window
 from ...emission.elements import Elements, elements_of
 from ...emission.emitting_surface import EmittingSurface
-from ...emission.exitance import texels_of
+from ...emission.exitance import square_texels_of
 from ...emission.of_emitter import surfaces_of
 from ...jit.batches import numbered
 from ...jit.from_numpy import from_numpy
@@ -44,9 +42,6 @@ OUTSHINES = 2.0  # a point is narrow light if it is so many times brighter than 
 # The limb of a wide body is not narrow light, as transects integrate it: its cosine to the lens is below `SLANTED`, the
 # body covers at least the share `COVERED` of a square around, the point is at most `GLARES` times as bright as that.
 SLANTED, COVERED, GLARES = 0.5, 0.5, 4.0
-# Largest cosine to the lens of a surface whose variation counts as that of a limb; largest share of a square that one
-# surface covers.
-GRAZING, SINGLE = 0.25, 1.1
 FEWEST_ELEMENTS = 1 << 12  # of a shape that is no mesh
 WIDE, MOST_POINTS = 2.0, 1 << 12  # least width of a wide element [pixels, blur radii]; most points of a thin one
 SHARP = 0.5  # blur radius [pixels] below which a point counts on its own pixel and those beside it
@@ -64,7 +59,7 @@ class NarrowLight:
     [pixels], at most 1.
 
     Mean radiance on film [W/mm²/sr], to a factor of two. `radiance`: the largest one of narrow spots [W/mm²/sr];
-    `variation`: the largest change of each pixel by variation of J_n finer than lines of sight are apart.
+    `variation`: that of each pixel by variation of J_n finer than lines of sight are apart, see `fine_variation`.
     """
 
     on_pixels: PixelArray
@@ -117,7 +112,7 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
     """The part of the light of points all over the surfaces that comes from narrow spots; 0 without points."""
     if points is None or not math.prod(window.shape):
         return NarrowLight.none(window.shape)
-    on_pixels, variation, points = np.zeros(window.shape), np.zeros(window.shape), points.seen_in(window)
+    on_pixels, points = np.zeros(window.shape), points.seen_in(window)
     if not (points.radiance > 0).any():
         return NarrowLight.none(window.shape)
     light, level = points.light(), points.level()
@@ -130,21 +125,14 @@ def narrow_light(points: Points | None, window: Window) -> NarrowLight:
         if (counts := here & shown).any():
             brightest = max(brightest, points[counts].cells(2**k).sums(light[counts]).max())
         there = points.near(reach + 2 * 2**k, window.shape)  # beyond, those of this level have no neighbours
-        here &= there & (points.apart < 1)
-        if not here.any():
-            continue
-        for number in np.unique(points.varied[here & (points.varied > 0)]):
-            near = there & (points.varied == number)
-            off = np.where(here[near], _beyond(points[near], 2**k), 0)
-            if (fine := off > 0).any():
-                variation += UNCERTAINTY * most_on_pixels(points[near][fine], off[fine], window.shape)
         here[there] &= _hidden(points[there], 2**k)
+        here &= there & (points.apart < 1)
         if here.any():
             on_pixels += spread(light[here], points[here], reach, window.shape)
             radiance = max(radiance, float(points.radiance[here].max()))
     in_focus = points.on_pixels(light, window.shape)
     edge_on = _edge_on(points, light, window.shape)
-    return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance, variation)
+    return NarrowLight(on_pixels, float(brightest), in_focus, edge_on, radiance, np.zeros(window.shape))
 
 
 def most_narrow_light(points: Points | None) -> float:
@@ -165,14 +153,6 @@ def most_narrow_light(points: Points | None) -> float:
             cell = np.unique(row * (1 << 32) + column, return_inverse=True)[1]
             most = max(most, float(np.bincount(cell, light[here], minlength=1).max()))
     return UNCERTAINTY * most
-
-
-def edge_on_light(points: Points | None, window: Window) -> PixelArray:
-    """`NarrowLight.edge_on` alone."""
-    if points is None or not math.prod(window.shape):
-        return np.zeros(window.shape)
-    points = points.seen_in(window)
-    return _edge_on(points, points.light(), window.shape)
 
 
 def peak_of_points(points: Points | None, window: Window) -> float:
@@ -231,11 +211,14 @@ class Points:
     def __getitem__(self, which: NDArray[np.bool_]) -> Points:
         return Points(*(column[which] for column in vars(self).values()))
 
-    def seen_in(self, window: Window) -> Points:
-        """The points whose light reaches a window, with positions relative to its corner."""
+    def seen_in(self, window: Window, around: int = 0) -> Points:
+        """The points whose light reaches a window, and those so many pixels, or blur radii, `around`, with positions
+        relative to its corner.
+        """
         left, top = window.corner
         points = replace(self, x=self.x - left, y=self.y - top)
-        return points[points.near(points.blur, window.shape) & (points.area > 0) & (points.cosine > 0)]
+        reach = points.blur + around * np.maximum(points.blur, 1)
+        return points[points.near(reach, window.shape) & (points.area > 0) & (points.cosine > 0)]
 
     def light(self) -> Column:
         """Radiance on film [W/mm²/sr] that each point alone gives to a pixel.
@@ -315,30 +298,6 @@ def _hidden(points: Points, side: float) -> NDArray[np.bool_]:
     return (points.radiance > OUTSHINES * around) & ~limb
 
 
-def _beyond(points: Points, side: float) -> Column:
-    """Largest difference of the radiance of each point of a surface from means over squares of a `side` [pixels], its
-    own and all around, where it is outside their range, extended by itself on both ends; 0 elsewhere [W/mm²/sr].
-
-    Where J_n is smooth, or steps between two values, all points are within the extended range. The radiance may vary
-    within a square where one part of the surface lies before another, and at the limb of a body.
-    """
-    cells = points.cells(side)
-    grid = Grid(cells.shape)
-    share = np.minimum(points.area / side**2, 1)
-    light, covered, count = (cells.sums(weight) for weight in (points.radiance * share, share, np.ones_like(share)))
-    mean = np.divide(light, covered, out=np.zeros_like(light), where=covered > 0)
-    unit = np.sqrt(covered / np.maximum(count, 1))  # of what a point stands for, twice as much as squares may have more
-    several = covered > SINGLE + 2 * unit
-    known = np.where(covered > COVERED, mean, np.nan)  # the rest of others belongs to larger elements
-    high, minus_low, behind = (
-        grid.array(grid.spread_max(grid.flat(np.nan_to_num(image, nan=-np.inf)))).ravel()[cells.number]
-        for image in (known, -known, several.astype(np.float64))
-    )
-    off = np.maximum(points.radiance + minus_low, high - points.radiance)
-    single = (points.cosine > GRAZING) & (behind == 0)
-    return np.where(single & (off > 2 * (high + minus_low)), off, 0)
-
-
 @dataclass(frozen=True)
 class _Cells:
     """Cells with points in them: `shape` (h, w) of their grid and, row by row, the `number` of each point's."""
@@ -381,7 +340,7 @@ def most_on_pixels(points: Points, each: Column, shape: tuple[int, int]) -> Pixe
 def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None, hidden: bool) -> Points:
     """Points all over a surface, with their images."""
     shape = surface.shape
-    texels = texels_of(surface.exitance)
+    texels = square_texels_of(surface.exitance)
     if shape.is_mesh():  # whose elements lie across the texels
         elements: Elements = elements_of(shape, 4 * texels if texels > 1 else 1)
     else:

@@ -193,7 +193,7 @@ class _Faces:
         and those that are not refined further."""
         draft = self.draft
         power, error, coverage = self._images(found)
-        draft.error = dr.select(wanted, dr.maximum(draft.error, draft.variation), draft.error)
+        draft.error = dr.select(wanted, dr.maximum(draft.error, draft.unseen_variation()), draft.error)
         brightest = dr.maximum(dr.max(dr.select(wanted, power, 0)), dr.opaque(mi.Float64, peak))
         tolerance = dr.opaque(mi.Float64, draft.quadrature.rtol) * brightest
         self._count_unmet(wanted, power)

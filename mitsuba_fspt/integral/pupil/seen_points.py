@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from ..lines.pose import Pose, Unlocated
 from ..lines.poses import Poses
 from ..lines.visible_window import glowing_boxes
 from .dark_bodies import DarkBodies
+from .fine_variation import fine_variation
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
 
 LEAST_SHARE = 0.25  # of the light, that courses have in which dark bodies are searched for
@@ -83,10 +84,10 @@ class SeenPoints:
         elsewhere = NarrowLight.none(window.shape)
         for points, courses in self.elsewhere:
             share = _share(courses, window).clip(max=1)
-            elsewhere = elsewhere.plus(narrow_light(points, window).times(share))
+            elsewhere = elsewhere.plus(_light(points, window).times(share))
         lines, most = self.unlocated
         anywhere = most * _share(lines, window).clip(max=1)
-        return Unseen(narrow_light(self.straight, window), elsewhere, anywhere, self._dark_bodies(window))
+        return Unseen(_light(self.straight, window), elsewhere, anywhere, self._dark_bodies(window))
 
     def _dark_bodies(self, window: Window) -> DarkBodies:
         """What bodies without light hide, and what passes between them, along straight lines and elsewhere."""
@@ -98,6 +99,11 @@ class SeenPoints:
             if share.max(initial=0.0) >= LEAST_SHARE:
                 found = found.plus(DarkBodies.seen(self.view, window, courses[0].camera), share)
         return found
+
+
+def _light(points: Points | None, window: Window) -> NarrowLight:
+    """Narrow light of points on a window, with fine variation of J_n."""
+    return replace(narrow_light(points, window), variation=fine_variation(points, window))
 
 
 def _share(courses: Sequence[Pose | Unlocated], window: Window) -> Array:
