@@ -40,6 +40,7 @@ MANY = 72
 # Number of transects from which their scatter shows edges of different blur; the share of the light of surfaces edge-on
 # that fewer may miss.
 SEVERAL_BLURS, MISSED_EDGE_ON = 24, 0.1
+STRAIGHT = 0.9  # least length of the mean of unit vectors at twice the angles of edges that run alike
 FAR = 1e30  # depth [mm] at which larger ones are clipped; the blur of an edge is finite there
 
 
@@ -126,6 +127,9 @@ class _Refinement:
         if len(rule) < SEVERAL_BLURS:
             unseen = dr.opaque(mi.Float64, MISSED_EDGE_ON) * draft.edge_on
             remaining = dr.select(self.has_jump, dr.maximum(remaining, unseen), remaining)
+            # The edge of a neighbour may end between all transects of a pixel, which run along it.
+            corner = self.has_jump & self.edges.turn(draft, self.has_jump)
+            remaining = dr.select(corner, self._above_tolerance(remaining), remaining)
             # Between pixels that see all and nothing of a body there is an outline, though no transect has crossed it.
             uncrossed = draft.outline & ~draft.grid.dilate(self.has_jump, 1)
             around = dr.maximum(around, draft.missed_edge_error(uncrossed))
@@ -254,6 +258,12 @@ class Edges:
         turn = dr.opaque(mi.Float64, math.pi / 2 if across else 0)
         self.angle = dr.select(has_jump | alike, self.angle, dr.atan2(y, x) + turn)
         dr.eval(self.angle, self.blur, self.sharp)
+
+    def turn(self, draft: Draft, has_jump: Mask) -> Mask:
+        """True where edges on a pixel and around, on pixels with a jump, have normals of different directions."""
+        weight, (sine, cosine) = dr.select(has_jump, mi.Float64(1), 0), dr.sincos(2 * self.angle)
+        number, x, y = (draft.grid.box_sum(weight * of, 1) for of in (1, cosine, sine))
+        return dr.square(x) + dr.square(y) < dr.square(dr.opaque(mi.Float64, STRAIGHT) * number)
 
 
 def _around(draft: Draft) -> int:
