@@ -32,7 +32,6 @@ from ...jit.from_numpy import from_numpy
 from ...jit.loops import repeat
 from ...jit.pixel_grid import Grid
 from ...jit.spectra import at_one_wavelength, scalar
-from ..lines.occlusion import hides_nothing
 from ..lines.specular import Specular, transmission
 from .node_rules import PLASTIC, twelve
 
@@ -97,13 +96,15 @@ class NarrowLight:
 
 
 def points_on_surfaces(
-    scene: mi.Scene, camera: Camera, specular: Specular | None = None, hidden: bool = True
+    scene: mi.Scene, camera: Camera, specular: Specular | None = None, hidden: bool = True, itself: bool = False
 ) -> Points | None:
     """Points all over the surfaces, imaged by `camera`; None where no emitter is an `fspt_surface`.
 
-    Along straight lines only, also through `specular` shapes. `hidden`: those that other surfaces hide are dark.
+    Along straight lines only, also through `specular` shapes. `hidden`: those that surfaces hide are dark, in a scene
+    of a single shape only if it may hide points `itself`.
     """
-    parts = [_seen(scene, surface, camera, specular, hidden) for surface in surfaces_of(scene)]
+    hides = hidden and (itself or len(scene.shapes()) > 1)
+    parts = [_seen(scene, surface, camera, specular, hides) for surface in surfaces_of(scene)]
     parts = [replace(part, varied=number * part.varied) for number, part in enumerate(parts, 1)]
     return Points.joined(parts) if parts else None
 
@@ -337,8 +338,8 @@ def most_on_pixels(points: Points, each: Column, shape: tuple[int, int]) -> Pixe
     return image
 
 
-def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None, hidden: bool) -> Points:
-    """Points all over a surface, with their images."""
+def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: Specular | None, hides: bool) -> Points:
+    """Points all over a surface, with their images; dark where a surface `hides` them."""
     shape = surface.shape
     texels = square_texels_of(surface.exitance)
     if shape.is_mesh():  # whose elements lie across the texels
@@ -349,7 +350,6 @@ def _seen(scene: mi.Scene, surface: EmittingSurface, camera: Camera, specular: S
     def radiance(si: mi.SurfaceInteraction3f, to_lens: mi.Vector3f) -> mi.Float:
         return scalar(surface.radiance(si, to_lens, mi.Bool(True)))
 
-    hides = hidden and (len(scene.shapes()) > 1 or not (surface.is_uniform() or hides_nothing(scene)))
     points = points_of(elements, camera, radiance, partial(in_sight, scene, camera, specular) if hides else None)
     return replace(points, varied=np.zeros_like(points.varied)) if surface.is_uniform() else points
 

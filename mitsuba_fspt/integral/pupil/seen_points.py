@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,19 @@ class SeenPoints:
             elsewhere = elsewhere.plus(_light(points, window).times(share))
         lines, most = self.unlocated
         anywhere = most * _share(lines, window).clip(max=1)
-        return Unseen(_light(self.straight, window), elsewhere, anywhere, self._dark_bodies(window))
+        return Unseen(self._straight_light(window), elsewhere, anywhere, self._dark_bodies(window))
+
+    def _straight_light(self, window: Window) -> NarrowLight:
+        """Light along straight lines. Where a single shape seems to have some, points that it hides itself are dark."""
+        light = _light(self.straight, window)
+        if len(self.view.scene.shapes()) > 1 or not (light.on_pixels.any() or light.variation.any()):
+            return light
+        return _light(self._in_sight, window)
+
+    @cached_property
+    def _in_sight(self) -> Points | None:
+        """`straight` of a single shape, without the points that it hides itself."""
+        return points_on_surfaces(self.view.scene, self.view.camera, self.view.specular, itself=True)
 
     def _dark_bodies(self, window: Window) -> DarkBodies:
         """What bodies without light hide, and what passes between them, along straight lines and elsewhere."""
