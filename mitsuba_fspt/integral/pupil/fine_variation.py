@@ -69,7 +69,9 @@ def _beyond(points: Points, side: float) -> Array:
     )
     known = (covered > COVERED).astype(np.float64)  # the rest of others belongs to larger elements
     at_border = (_around(known) < 8.5).ravel()[cells.number]
-    plane, found = _Plane.through(x, y, mean, known), np.where((points.cosine > GRAZING) & ~several, np.inf, 0)
+    plane = _Plane.through(x, y, mean, known)
+    judged = (points.cosine > GRAZING) & ~several & ~plane.line.ravel()[cells.number]
+    found = np.where(judged, np.inf, 0)
     for model, where in ((plane, True), (plane.level(), at_border)):
         low, high = (end.ravel()[cells.number] for end in model.ends(x, y, mean, known))
         its = points.radiance - model.at(points.x, points.y, cells.number)
@@ -82,13 +84,14 @@ def _beyond(points: Points, side: float) -> Array:
 @dataclass(frozen=True)
 class _Plane:
     """Planes of least squares through the values of each square (h, w) and of those around: its `mean` at the middle
-    (x, y), and slopes, which are 0 where the squares lie on a line.
+    (x, y), and slopes, which are 0 where the squares lie on a `line`, as beside a border of the surface.
     """
 
     mean: Array
     x: Array
     y: Array
     slopes: tuple[Array, Array]
+    line: NDArray[np.bool_]
 
     @classmethod
     def through(cls, x: Array, y: Array, value: Array, known: Array) -> _Plane:
@@ -105,7 +108,7 @@ class _Plane:
         flat = det <= COLLINEAR * (xx + yy) ** 2
         det = np.where(flat, 1, det)
         slopes = (np.where(flat, 0, s / det) for s in (yy * xv - xy * yv, xx * yv - xy * xv))
-        return cls(middle[2], middle[0], middle[1], (*slopes,))  # type: ignore[arg-type]  # two
+        return cls(middle[2], middle[0], middle[1], (*slopes,), flat)  # type: ignore[arg-type]  # two
 
     def level(self) -> _Plane:
         """The same without slopes."""

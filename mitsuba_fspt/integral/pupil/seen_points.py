@@ -23,6 +23,7 @@ from .fine_variation import fine_variation
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
 
 LEAST_SHARE = 0.25  # of the light, that courses have in which dark bodies are searched for
+SEEMING = 1e-4  # of the brightest pixel: less light of points that are hidden may count as an error
 MOST_BOXES = 8  # of what glows, one by one; the box around more of them counts in their place
 
 Array = NDArray[np.float64]
@@ -93,7 +94,8 @@ class SeenPoints:
     def _straight_light(self, window: Window) -> NarrowLight:
         """Light along straight lines. Where a single shape seems to have some, points that it hides itself are dark."""
         light = _light(self.straight, window)
-        if len(self.view.scene.shapes()) > 1 or not (light.on_pixels.any() or light.variation.any()):
+        most = max(float(image.max(initial=0.0)) for image in (light.on_pixels, light.variation))
+        if len(self.view.scene.shapes()) > 1 or most <= SEEMING * light.brightest:
             return light
         return _light(self._in_sight, window)
 
