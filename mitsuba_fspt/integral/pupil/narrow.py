@@ -375,6 +375,7 @@ def points_of(
     shown = dr.full(mi.Float, 1, dr.width(at.image))
     if visible:
         shown = dr.select(visible(at.place, at.normal), shown, 0)
+        dr.eval(shown)
     columns = (shown * at.radiance, shown, at.image, at.cosine, at.front, at.edge_on, at.blur, at.centre.x, at.centre.y)
     seen = np.array([column.numpy() for column in columns], np.float64)
     unseen = ~np.isfinite(seen).all(axis=0) | np.repeat(long, counts)

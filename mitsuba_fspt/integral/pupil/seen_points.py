@@ -22,7 +22,7 @@ from .dark_bodies import DarkBodies
 from .fine_variation import fine_variation
 from .narrow import NarrowLight, Points, most_narrow_light, narrow_light, points_on_surfaces
 
-LEAST_SHARE = 0.25  # of the light, that courses have in which dark bodies are searched for
+LEAST_SHARE = 0.25  # of the light, that courses have in which dark bodies and fine variation are searched for
 SEEMING = 1e-4  # of the brightest pixel: less light of points that are hidden may count as an error
 MOST_BOXES = 8  # of what glows, one by one; the box around more of them counts in their place
 
@@ -86,7 +86,8 @@ class SeenPoints:
         elsewhere = NarrowLight.none(window.shape)
         for points, courses in self.elsewhere:
             share = _share(courses, window).clip(max=1)
-            elsewhere = elsewhere.plus(_light(points, window).times(share))
+            light = _light if share.max(initial=0.0) >= LEAST_SHARE else narrow_light
+            elsewhere = elsewhere.plus(light(points, window).times(share))
         lines, most = self.unlocated
         anywhere = most * _share(lines, window).clip(max=1)
         return Unseen(self._straight_light(window), elsewhere, anywhere, self._dark_bodies(window))
