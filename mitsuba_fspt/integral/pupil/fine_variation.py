@@ -68,7 +68,7 @@ def _beyond(points: Points, side: float) -> Array:
         for of in (points.radiance, points.x, points.y)
     )
     known = (covered > COVERED).astype(np.float64)  # the rest of others belongs to larger elements
-    at_border = (_around(known) < 8.5).ravel()[cells.number]
+    at_border = (_around(known) < 9 - 0.5).ravel()[cells.number]  # not all nine, to rounding
     plane = _Plane.through(x, y, mean, known)
     judged = (points.cosine > GRAZING) & ~several & ~plane.line.ravel()[cells.number]
     found = np.where(judged, np.inf, 0)
